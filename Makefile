@@ -2,6 +2,7 @@
 #   make demo    the environment, then `bayesdist demo`
 #   make test    the environment with the test extra, checks of the code and the tests: some ten
 #                minutes on two cores
+#   make core    tests of the core while all file formats and missions are hidden
 #   make types   mypy, in an environment of its own whose versions are exact (.ci/types.txt): what a
 #                new release of numpy or mypy thinks of the code fails nobody's `make test`
 #   make ci      `make test` and `make types` at once, as .ci/run does
@@ -27,7 +28,7 @@ PIP     = -m pip install --quiet --disable-pip-version-check
 # else each process that tests and commands start compiles all modules again: seconds, dozens of times
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test ci style types imports suite test-full test-matrix coverage docs bench bench-check \
+.PHONY: demo test ci style types imports suite core test-full test-matrix coverage docs bench bench-check \
         lint clean
 
 demo: $(VENV)/.installed
@@ -35,10 +36,12 @@ demo: $(VENV)/.installed
 
 test: style
 	$(MAKE) --no-print-directory -j2 imports suite
+	$(MAKE) --no-print-directory core
 
 # all at once: mypy takes a minute of one core at first, and the tests wait for each other at times
 ci: style
 	$(MAKE) --no-print-directory -j3 types imports suite
+	$(MAKE) --no-print-directory core
 
 style: $(VENV)/.installed-test
 	$(BIN)/ruff check .
@@ -52,6 +55,12 @@ imports: $(VENV)/.installed-test
 
 suite: $(VENV)/.installed-test
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+
+# The core works without formats and missions. These rooms take half a minute; all of them are
+#   make core CORE="utils files model data products calibration simulate infer diagnose assess"
+CORE = utils model products
+core: $(VENV)/.installed-test
+	BAYESDIST_PLUGINS= $(BIN)/python -m pytest -q $(addprefix tests/,$(CORE))
 
 test-full: $(VENV)/.installed-test
 	BAYESDIST_FULL=1 $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder

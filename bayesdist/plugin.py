@@ -46,6 +46,8 @@ class Mission:
     # kinds of `[[budget]]` rows with one sigma: each a callable (name, kind, sigma, solution,
     # source) that returns an error term, such as `bayesdist.assess.terms.parameters.ScaleError`
     error_terms: Mapping[str, str] = field(default_factory=dict)
+    # sets of files for [products.release]: each a `bayesdist.app.products.release_set.ReleaseSet`
+    releases: Mapping[str, str] = field(default_factory=dict)
     # module that registers figures and tables with `bayesdist.report.contents.REPORT`
     report: str = ""
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from bayesdist.infer import kernel
+from bayesdist.plugin import SELECTION
 from tests import ALONE
 from tests.reduced import FULL
 
@@ -68,7 +69,12 @@ FIRST = (
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The order of FIRST, then that of the folders."""
+    """The order of FIRST, then that of the folders; tests that need plugins are skipped without."""
+    if os.environ.get(SELECTION) == "":
+        hidden = pytest.mark.skip(reason=f"{SELECTION} hides formats and missions")
+        for item in items:
+            if item.get_closest_marker("plugins"):
+                item.add_marker(hidden)
 
     def place(item: pytest.Item) -> int:
         return next((k for k, name in enumerate(FIRST) if item.nodeid.startswith(name)), len(FIRST))

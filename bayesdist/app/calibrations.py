@@ -46,7 +46,7 @@ def read_calibration(
         A calibration file (its format is recognized by its content), the folder of a run, or the
         ``posterior.nc`` or ``fit.nc`` in it.
     filter : str, optional
-        Filter of an IDCTAB, with the names of both wheels joined by a comma, or the band of WISE
+        Filter or band, if the file has several; names in two wheels are joined by a comma
         meta-data.  Needed if the file has several.
     size : tuple of float, optional
         Number of columns and rows.  Needed for a header that does not state them.

@@ -315,7 +315,7 @@ def area_map(
 ) -> AreaMap:
     """Relative pixel area, with its uncertainty by linear error propagation.
 
-    Multiply flat-fielded photometry by this map, as in Figure 4.5 of section 4.1 of the ACS
+    Multiply flat-fielded photometry by this map, as in Figure 4.5 of section 4.1 of the HST
     handbook. The frame of an exposure is linear and cancels, so the map is valid for all exposures.
 
     Parameters

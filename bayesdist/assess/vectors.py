@@ -99,7 +99,7 @@ def distortion_vectors(
         angles, or pixels along rotated or mirrored axes, the pixel position is first transformed by
         the similarity (scale, rotation, parity) that fits best over the detector.
         'non_linear': only terms of order 2 and higher about the reference pixel, as in Figure 4.1
-        of section 4.1 of the ACS handbook.
+        of section 4.1 of the camera's handbook.
     epoch : float, optional
         Decimal years; required if the model depends on time.
     chip : int, optional

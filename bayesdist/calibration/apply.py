@@ -1,6 +1,6 @@
 """Transformation between detector pixels and an undistorted output frame, with errors.
 
-The forward transformation has the four steps of section 4.1.5 of the ACS handbook:
+The forward transformation has four steps:
 
 1. Pixels of subarrays are converted to pixels of the full chip, and the offset from the reference
    pixel is taken.
@@ -48,12 +48,12 @@ class OutputFrame:
         If the scale or the velocity aberration factor is not positive, or the origin not finite.
     """
 
-    scale: float  # size of an output pixel, in the calibration's unit (arcsec for an IDCTAB)
+    scale: float  # size of an output pixel, in the calibration's unit (such as arcsec)
     origin: tuple[float, float] = (0.0, 0.0)  # output pixel of the calibration's zero point
     vafactor: float = 1.0  # velocity aberration factor by which positions are multiplied
 
     def __post_init__(self) -> None:
-        for name, value in (("scale", self.scale), ("VAFACTOR", self.vafactor)):
+        for name, value in (("scale", self.scale), ("aberration factor", self.vafactor)):
             if not (np.isfinite(value) and value > 0):
                 raise InputError(
                     f"the {name} is {value}", where="output frame", do="give a positive number"

@@ -3,8 +3,8 @@
 A pixel area map is the area of each pixel on the sky relative to that of a corrected pixel, SCALE
 squared.  Flat-fielding makes the sky background uniform and thereby divides each pixel by its
 area.  Multiplication by the map reverses this, so that photometry agrees with that of drizzled
-images.  The maps of ACS follow this definition, without velocity aberration.  Those of WFC3 are
-relative to the area of one pixel instead.
+images.  Some observatories follow this definition, without velocity aberration; maps of others are
+relative to the area of one pixel.
 """
 
 from __future__ import annotations

@@ -7,4 +7,4 @@ by name when they are called.  No other module of a lower layer refers to a high
 WRITE = "bayesdist.products.writing:write_calibration"
 TO_SKY = "bayesdist.calibration.sky_table:table_on_sky"
 WCS = "bayesdist.calibration.wcs:wcs_of_chip"
-SIP = "bayesdist.formats.sip.build:sip_wcs"
+FITS_WCS = "bayesdist.products.registry:fits_wcs"

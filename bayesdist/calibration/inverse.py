@@ -4,8 +4,8 @@
 
 This package inverts the forward polynomials by Newton's method instead.  Explicit inverses are
 needed for programs that cannot iterate or that use them as a starting point.  AP and BP of SIP have
-this form, with the CD matrix as L, and so have the INVERSE rows of an IDCTAB, with L = 1 and
-P(0, 0) = 0.
+this form, with the CD matrix as L, and so have inverse rows of tables of coefficients, with L = 1
+and P(0, 0) = 0.
 """
 
 from __future__ import annotations

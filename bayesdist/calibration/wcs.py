@@ -446,7 +446,7 @@ class CalibrationWCS(BaseLowLevelWCS, HighLevelWCSMixin):
                 where=self.calibration.name,
                 do=f"give max_residual={_rounded_up(worst):g} to accept that, or use to_gwcs",
             )
-        return load_object(hooks.SIP)(self._on_tangent_plane(chip_map), placement.point)
+        return load_object(hooks.FITS_WCS)("sip", self._on_tangent_plane(chip_map), placement.point)
 
     def _on_tangent_plane(self, chip_map: ChipMap) -> Calibration:
         """Calibration of the chip with u to the east and v to the north, in arcsec."""

@@ -17,11 +17,6 @@ from .formats.files import (
     MatchFormat as MatchFormat,
     input_files as input_files,
 )
-from .formats.hst1pass import (
-    Hst1passList as Hst1passList,
-    read_hst1pass as read_hst1pass,
-    read_matchup as read_matchup,
-)
 from .magnitude_errors import MagnitudeErrors as MagnitudeErrors
 from .matches import Matches as Matches
 from .matching.campaign import (

@@ -25,7 +25,7 @@ from bayesdist.utils.text import ascii_of, refuse_control_characters
 log = logging.getLogger("bayesdist")
 
 _NUMBERS = ("exptime", "vafactor", "pa_v3", "ra", "dec")
-_SLOWEST = 2e-4  # for anything in orbit around the Earth, |VAFACTOR - 1| is below 1.4e-4
+_SLOWEST = 2e-4  # for anything in orbit around the Earth, |factor - 1| is below 1.4e-4
 _UNITS = {"epoch": "yr", "exptime": "s", "pa_v3": "deg", "ra": "deg", "dec": "deg"}
 # plausible ranges, which exclude angles in other units and unrelated numbers
 _RANGES = {
@@ -62,7 +62,7 @@ class Exposure:
     exptime : float, optional
         Exposure time, seconds.
     vafactor : float, optional
-        Scale factor of velocity aberration, as in the keyword VAFACTOR.
+        Scale factor of velocity aberration; larger than 1 if the telescope moves towards the field.
     pa_v3 : float, optional
         Position angle of the V3 axis, degrees.
     ra, dec : float, optional
@@ -72,7 +72,7 @@ class Exposure:
     ------
     InputError
         If the name is empty, if a number is not finite or outside its plausible range, or if
-        VAFACTOR is too far from 1 for any orbit around the Earth.
+        The factor is too far from 1 for any orbit around the Earth.
     """
 
     name: str
@@ -109,9 +109,9 @@ class Exposure:
                 )
         if self.vafactor is not None and abs(self.vafactor - 1.0) > _SLOWEST:
             raise InputError(
-                f"VAFACTOR is {self.vafactor}, and lies within {_SLOWEST:g} of 1 for every orbit",
+                f"vafactor is {self.vafactor}, and lies within {_SLOWEST:g} of 1 for every orbit",
                 where=f"exposure {self.name}",
-                do="give the keyword VAFACTOR of the science header",
+                do="give the factor of velocity aberration of the science header",
             )
 
 
@@ -261,19 +261,19 @@ class ExposureLog:
         return np.array([np.nan if value is None else value for value in stated], float)
 
     def with_aberration(self) -> ExposureLog:
-        """Log with VAFACTOR computed where it is missing.
+        """Log with factors of velocity aberration computed where they are missing.
 
         Only the orbital motion of the Earth is included; the orbit of HST adds up to 2.5e-5.
 
         Returns
         -------
         ExposureLog
-            Log in which every exposure has VAFACTOR.
+            Log in which every exposure has a factor.
 
         Raises
         ------
         InputError
-            If an exposure has neither VAFACTOR nor a target.
+            If an exposure has neither a factor nor a target.
         """
         out = []
         for exposure in self.exposures:

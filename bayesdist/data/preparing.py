@@ -92,7 +92,7 @@ def motion_error_line(catalog: ReferenceCatalog) -> MotionErrorLine:
 
 
 def select_motions(catalog: ReferenceCatalog) -> ReferenceCatalog:
-    """Select stars with well measured proper motions (the red line of ACS ISR 2015-06, Figure 3).
+    """Select stars with well measured proper motions (Kozhurina-Platais et al. (2015), Figure 3).
 
     Parameters
     ----------
@@ -162,8 +162,8 @@ def centroid_errors(table: Matches, total: MagnitudeErrors) -> MagnitudeErrors:
 def neutralise_aberration(table: Matches, log: ExposureLog) -> Matches:
     """Matches with catalogue positions converted to a scale free of velocity aberration.
 
-    A true offset on the sky is VAFACTOR times the offset in the aberration-free scale of the
-    detector. Positions and their errors are therefore divided by VAFACTOR. Another origin would
+    A true offset on the sky is the factor times the offset in the aberration-free scale of the
+    detector. Positions and their errors are therefore divided by it. Another origin would
     shift all stars of an exposure equally.
 
     Parameters
@@ -171,7 +171,7 @@ def neutralise_aberration(table: Matches, log: ExposureLog) -> Matches:
     table : Matches
         Matches with positions of the catalogue.
     log : ExposureLog
-        Log with the VAFACTOR of each exposure of the table.
+        Log with the factor of velocity aberration of each exposure of the table.
 
     Returns
     -------
@@ -181,7 +181,7 @@ def neutralise_aberration(table: Matches, log: ExposureLog) -> Matches:
     Raises
     ------
     InputError
-        If an exposure is not in the log or has no VAFACTOR; the message names the first such
+        If an exposure is not in the log or has no factor; the message names the first such
         exposure.
     """
     for name in table.exposures:

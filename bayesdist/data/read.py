@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Unpack
 
@@ -20,7 +21,6 @@ from bayesdist.data.formats.files import (
     mission_formats,
     read_written_matches,
 )
-from bayesdist.data.formats.hst1pass import is_matchup, read_hst1pass, read_matchup
 from bayesdist.data.matches import Matches
 from bayesdist.data.matching.table import match_table
 from bayesdist.data.reading.columns import numbered, text_labels
@@ -36,9 +36,8 @@ from bayesdist.data.sky import mean_direction
 from bayesdist.data.tables.checks import absent
 from bayesdist.data.tables.column import SourceColumn
 from bayesdist.data.tables.names import ALIASES, find_columns
-from bayesdist.errors import InputError
+from bayesdist.errors import InputError, required
 from bayesdist.files.tables import read_table
-from bayesdist.files.unpacked import read_lines
 
 PathLike = str | os.PathLike[str]
 # other quantities are omitted: 'mag', if present, is the magnitude of the index star
@@ -60,10 +59,9 @@ def read_matches(
         there are several files without a column of exposures, each file is one exposure named after
         the file. Objects with columns are passed on to `Matches.from_table`.
     format : str, optional
-        'table' (.ecsv, .csv, .fits, .parquet, .vot, .tbl and several kinds of text), 'hst1pass'
-        (lists with raw and corrected positions), 'matchup' (such lists and the MATCHUP master with
-        which they are matched), 'astrometry.net' (corr.fits), 'bayesdist' (matches.h5 of a saved
-        run), a format added by a mission, or 'auto': recognized by name and content.
+        'table' (.ecsv, .csv, .fits, .parquet, .vot, .tbl and several kinds of text),
+        'astrometry.net' (corr.fits), 'bayesdist' (matches.h5 of a saved run), a format added by a
+        mission, or 'auto': recognized by name and content.
     **options
         Fields of `ReadOptions` by name: columns, unit, sigma, pixel_origin, tangent_point, epoch,
         catalogue_epoch, chips, not_finite, same_position, plate_scale.
@@ -102,9 +100,9 @@ def read_matches(
         return Matches(**match_arguments(path, reading)).as_read(reading.plane_sigma)
     files = input_files(path)
     kinds = [kind_of(file, reading.columns) if format == "auto" else format for file in files]
-    masters = [file for file, kind in zip(files, kinds, strict=True) if kind == "matchup"]
-    if masters:
-        table = _read_with_master(files, kinds, reading)
+    master_format = next((kind for kind in kinds if _is_of_masters(kind)), None)
+    if master_format is not None:
+        table = _read_with_master(master_format, files, kinds, reading)
     else:
         in_parts = isinstance(path, str | os.PathLike) and Path(path).is_dir()
         table = _read_plain(files, kinds, reading, in_parts=in_parts)
@@ -116,17 +114,19 @@ def _read_plain(
 ) -> Matches:
     """Matches from files that hold both pixels and reference positions."""
     added_formats = mission_formats()
+    table_readers = {
+        kind: format_.read for kind, format_ in added_formats.items() if format_.read is not None
+    }
     names: Sequence[str | None] = exposure_names(files)
-    if in_parts or (len(files) == 1 and kinds[0] in ("table", "bayesdist", *added_formats)):
+    if in_parts or (len(files) == 1 and kinds[0] in ("table", "bayesdist", *table_readers)):
         names = [None] * len(files)
     tables = {
-        file: added_formats[kind].read(file) if kind in added_formats else read_table(file)
+        file: table_readers.get(kind, read_table)(file)
         for file, kind in zip(files, kinds, strict=True)
-        if kind in ("table", "astrometry.net", *added_formats)
+        if kind in ("table", "astrometry.net", *table_readers)
     }
     options = _with_common_chips(tables, _with_common_point(tables, kinds, options))
     readers: dict[str, Callable[[Path, str | None], Matches]] = {
-        "hst1pass": lambda file, name: _read_list(file, name, options),
         "bayesdist": lambda file, _: _read_record(file, options),
         "astrometry.net": lambda file, name: _read_corr(file, tables[file], name, options),
         "table": lambda file, name: Matches(
@@ -135,7 +135,9 @@ def _read_plain(
             )
         ),
     }
-    readers |= dict.fromkeys(added_formats, readers["table"])
+    readers |= dict.fromkeys(table_readers, readers["table"])
+    for key in added_formats.keys() - table_readers.keys():
+        readers[key] = partial(_read_list, key, options=options)
     matches = Matches.concatenate(
         [readers[kind](file, name) for file, kind, name in zip(files, kinds, names, strict=True)]
     )
@@ -195,12 +197,20 @@ def _with_common_chips(tables: Mapping[Path, Table], options: ReadOptions) -> Re
     return replace(options, chips=numbered(names)) if names else options
 
 
-def _read_list(file: Path, name: str | None, options: ReadOptions) -> Matches:
+def _is_of_masters(key: str) -> bool:
+    """True for a format of catalogues to which lists of another format are matched."""
+    format_ = mission_formats().get(key)
+    return format_ is not None and format_.master is not None
+
+
+def _read_list(key: str, file: Path, name: str | None, options: ReadOptions) -> Matches:
+    """Matches of a list in a format that fixes its columns."""
     names = "columns tangent_point epoch catalogue_epoch not_finite same_position plate_scale"
-    options.refuse_fixed(str(file), "hst1pass", *names.split(), *_other_origin(options))
+    options.refuse_fixed(str(file), key, *names.split(), *_other_origin(options))
     if options.unit not in (None, "pix"):
-        options.refuse_fixed(str(file), "hst1pass", "unit")
-    return read_hst1pass(file).matches(name=name)
+        options.refuse_fixed(str(file), key, "unit")
+    read = required(mission_formats()[key].matches, f"the format {key!r} has no matches")
+    return read(file, name)
 
 
 def _read_record(file: Path, options: ReadOptions) -> Matches:
@@ -242,22 +252,29 @@ def _read_corr(file: Path, table: Table, name: str | None, options: ReadOptions)
     )
 
 
-def _read_with_master(files: Sequence[Path], kinds: Sequence[str], options: ReadOptions) -> Matches:
-    """Matches of hst1pass lists with the MATCHUP master that is among the files."""
+def _read_with_master(
+    key: str, files: Sequence[Path], kinds: Sequence[str], options: ReadOptions
+) -> Matches:
+    """Matches of star lists with the master of the format `key` that is among the files."""
+    format_ = mission_formats()[key]
     masters: list[Path] = []
     lists: list[Path] = []
     for file, kind in zip(files, kinds, strict=True):
-        is_master = kind == "matchup" and is_matchup(read_lines(file))
+        is_master = kind == key and format_.recognizes(file)
         (masters if is_master else lists).append(file)
     if len(masters) != 1 or not lists:
         raise InputError(
-            f"{len(masters)} MATCHUP masters and {len(lists)} lists are named: a master alone has "
-            "no detector positions",
+            f"{len(masters)} masters of the format {key!r} and {len(lists)} lists are named: a "
+            "master alone has no detector positions",
             where=", ".join(str(file) for file in files),
-            do="name one master together with the hst1pass lists to match with it",
+            do=f"name one master together with the {format_.lists} lists to match with it",
         )
     names = exposure_names(lists)
     detections = Matches.concatenate(
-        [_read_list(file, name, options) for file, name in zip(lists, names, strict=True)]
+        [
+            _read_list(format_.lists, file, name, options)
+            for file, name in zip(lists, names, strict=True)
+        ]
     )
-    return match_table(detections, read_matchup(masters[0]))
+    read = required(format_.master, f"the format {key!r} has no masters")
+    return match_table(detections, read(masters[0]))

@@ -7,9 +7,9 @@ from the Earth. Their errors include those of motion and parallax.
 
 Effects of the Earth's motion on positions: parallax, and the scale of aberration.
 
-    VAFACTOR = sqrt(1 - b^2) / (1 - n . b),    b = velocity / c
+    factor = sqrt(1 - b^2) / (1 - n . b),    b = velocity / c
 
-Stars are displaced towards the apex of the motion: a true offset on the sky is VAFACTOR times the
+Stars are displaced towards the apex of the motion: a true offset on the sky is the factor times the
 offset computed with an aberration-free pixel scale (Cox & Gilliland 2002, HST Calibration
 Workshop). Aberration is conformal, so the factor is the same in all directions.
 
@@ -264,7 +264,7 @@ def velocity_aberration(
     Returns
     -------
     float
-        VAFACTOR; larger than 1 if the telescope moves towards the target.
+        Factor of velocity aberration; larger than 1 if the telescope moves towards the target.
 
     Raises
     ------

@@ -11,8 +11,7 @@ import numpy as np
 from astropy.table import Table
 
 from bayesdist.data.detections import Detections
-from bayesdist.data.formats.files import exposure_names, input_files, kind_of
-from bayesdist.data.formats.hst1pass import read_hst1pass
+from bayesdist.data.formats.files import exposure_names, input_files, kind_of, mission_formats
 from bayesdist.data.repeated import first_duplicate
 from bayesdist.data.tables.checks import COMPLETED, counted, row_number
 from bayesdist.data.tables.column import SourceColumn
@@ -44,8 +43,8 @@ class StarCuts:
     Parameters
     ----------
     mag : tuple of float, optional
-        Brightest and faintest instrumental magnitude. For ACS/WFC lists, (-14, -10) selects the
-        well measured stars (ISR 2015-06, Figure 5).
+        Brightest and faintest instrumental magnitude. For star lists of
+        the HST, (-14, -10) typically selects the well measured stars.
     saturation : float, optional
         Magnitude limit; brighter stars are saturated.
     q_max : float, optional
@@ -114,14 +113,15 @@ def read_star_lists(
     Parameters
     ----------
     path : path-like or sequence of path-like
-        Files, patterns or a folder of Parquet files: tables as for `read_matches`, or lists of
-        hst1pass. A table with a column of exposures may hold several of them; any other file is one
-        exposure, named after the file.
+        Files, patterns or a folder of Parquet files: tables as for `read_matches`, or lists in a
+        format added by a mission. A table with a column of exposures may hold several of them; any
+        other file is one exposure, named after the file.
     columns : mapping of str to str, optional
         Column of each quantity: x y exposure chip mag flux q epoch sigma_x sigma_y. Without a
-        column of chips, all are chip 1. Lists of hst1pass have fixed columns. Pixels are converted
-        if the column names or the header show that they count from 0. Fluxes are converted to
-        magnitudes with zero point 0 if there are no magnitudes and all fluxes are positive.
+        column of chips, all are chip 1. Formats of missions have fixed columns. Pixels are
+        converted if the column names or the header show that they count from 0. Fluxes are
+        converted to magnitudes with zero point 0 if there are no magnitudes and all fluxes are
+        positive.
     errors : bool, optional
         True to read errors of the pixels; the rms of the errors of x and y is used.
 
@@ -141,11 +141,13 @@ def read_star_lists(
     for file, name in zip(files, exposure_names(files), strict=True):
         named = without_codec(file.name).endswith(tuple(TABLE_SUFFIXES))
         kind = "table" if named else kind_of(file, columns)
-        if kind == "hst1pass" and not errors:
-            out.append(read_hst1pass(file).detections(name=name))
-        elif kind == "hst1pass":
+        format_ = mission_formats().get(kind)
+        read = None if format_ is None else format_.detections
+        if read is not None and not errors:
+            out.append(read(file, name))
+        elif read is not None:
             raise InputError(
-                "a list of hst1pass has no errors of its pixels",
+                f"a list of the format {kind!r} has no errors of its pixels",
                 where=str(file),
                 do="have them measured, by magnitude",
             )
@@ -155,7 +157,7 @@ def read_star_lists(
             raise FormatError(
                 f"has matches or a catalogue ({kind}), and star lists are asked for",
                 where=str(file),
-                do="give tables with x, y, or lists of hst1pass",
+                do="give star lists, or tables with x, y",
             )
     names = [stars.name for stars in out]
     for k, stars in enumerate(out):

@@ -1,4 +1,4 @@
-"""The test of ACS ISR 2015-06, section 6: alignment of two exposures of the run.
+"""The test of Kozhurina-Platais et al. (2015), section 6: alignment of two exposures of the run.
 
 Corrected positions of the same stars differ by a shift, a rotation and a scale if the calibration
 is correct, and by a pattern if it is not.

@@ -5,6 +5,10 @@ from .every import (
     lint as lint,
     list_formats as list_formats,
 )
+from .hst1pass import (
+    read_hst1pass as read_hst1pass,
+    read_matchup as read_matchup,
+)
 from .idctab.build import idctab_from_solution as idctab_from_solution
 from .idctab.table import (
     IdcTab as IdcTab,
@@ -23,7 +27,3 @@ from .sip.build import sip_from_solution as sip_from_solution
 from .sip.header import SipHeader as SipHeader
 from .sip.read import read_sip as read_sip
 from .sip.write import write_sip as write_sip
-from .star_lists import (
-    read_hst1pass as read_hst1pass,
-    read_matchup as read_matchup,
-)

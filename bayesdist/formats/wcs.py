@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from bayesdist.formats.sip.format import describe_wcs
 from bayesdist.products.common.cards import holds_wcs
 from bayesdist.products.common.celestial import (
     HELD_PROJECTIONS,
@@ -11,6 +10,7 @@ from bayesdist.products.common.celestial import (
 )
 from bayesdist.products.common.content import Content
 from bayesdist.products.common.document import Format
+from bayesdist.products.common.wcs_text import describe_wcs
 
 
 def _parse(content: Content) -> Content | None:

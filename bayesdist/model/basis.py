@@ -31,7 +31,7 @@ def polynomial_terms(order: int) -> tuple[tuple[int, int], ...]:
     """Powers (i, j) of x and y up to a total order.
 
     The terms are sorted by total order, then by descending power of x: 1, x, y, x^2, xy, y^2, ...,
-    as in Equations 1-2 of ACS ISR 2015-06.
+    as in Equations 1-2 of Kozhurina-Platais et al. (2015).
 
     Parameters
     ----------

@@ -31,7 +31,7 @@ class Chip:
     Parameters
     ----------
     number : int
-        Chip number, as in the data and in the column DETCHIP of an IDCTAB.
+        Chip number, as in the data and in calibration files.
     name : str
     size : tuple of float or Quantity
         Numbers of columns and rows.

@@ -2,8 +2,8 @@
 
     C(t) = C + step_s + rate_s (t - t0_s)          for t in segment s; step_0 = 0
 
-This is Equation 3 of ACS ISR 2015-06, in which the segments before and after Servicing Mission 4
-have different reference dates.
+This is Equation 3 of Kozhurina-Platais et al. (2015), in which the segments before and after
+Servicing Mission 4 have different reference dates.
 """
 
 from __future__ import annotations

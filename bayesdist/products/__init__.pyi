@@ -14,8 +14,3 @@ from .registry import (
     open_document as open_document,
     read_calibration as read_calibration,
 )
-from .release import (
-    Period as Period,
-    Release as Release,
-    write_release as write_release,
-)

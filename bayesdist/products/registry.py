@@ -31,6 +31,7 @@ from bayesdist.products.common.read_back import ReadBack, by_calibrations, of_ch
 
 if TYPE_CHECKING:
     from astropy.table import Table
+    from astropy.wcs import WCS
 
 
 @cache
@@ -198,6 +199,12 @@ def format_of(key: str) -> Format:
         f"there is no format {key!r} that can be built",
         do=f"{meant}choose one of {', '.join(names)}",
     )
+
+
+def fits_wcs(key: str, calibration: Calibration, point: tuple[float, float]) -> WCS:
+    """`astropy.wcs.WCS` of a one-chip calibration in a format; see `Format.fits_wcs`."""
+    function = required(format_of(key).fits_wcs, f"the format {key!r} is not read by astropy.wcs")
+    return function(calibration, point)
 
 
 def list_formats() -> Table:

@@ -38,7 +38,7 @@ def dither_pattern(
 ) -> tuple[Float, Float]:
     """Offsets and roll angles of dithered exposures that sample all spatial scales.
 
-    As in the calibration programme of ACS (ACS handbook, 4.1.1), the logarithms of the offset
+    As in calibration programmes of HST, the logarithms of the offset
     lengths are uniformly distributed, the directions are random, and the roll angles are used
     cyclically.
 

@@ -20,6 +20,8 @@ from bayesdist.errors import InputError
 from bayesdist.model import PolynomialBasis
 from bayesdist.products.registry import read_calibration
 
+pytestmark = pytest.mark.plugins
+
 SIZE = (1000.0, 800.0)
 BASIS = PolynomialBasis(4, SIZE, (500.0, 400.0))
 LOW = PolynomialBasis(3, SIZE, (300.0, 420.0))

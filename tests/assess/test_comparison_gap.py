@@ -23,6 +23,8 @@ from bayesdist.simulate import simulate_matches
 from tests.app.support import good
 from tests.reduced import only_in_full
 
+pytestmark = pytest.mark.plugins
+
 CHIPS = tuple(Chip(k, f"WFC{k}", (512.0, 256.0), (256.0, 128.0)) for k in (2, 1))
 NAMES = ("shift_x", "shift_y", "scale", "rotation")
 

@@ -15,6 +15,8 @@ from ..formats.test_tpv import SCAMP_SIZE, scamp_head
 from ..real.sip_sets import SIZE, read_sets
 from .cameras import apart
 
+pytestmark = pytest.mark.plugins
+
 EXACT = 4 * 3600 * np.spacing(360.0)  # arcsec: rounding of right ascensions
 
 

@@ -19,6 +19,8 @@ from bayesdist.errors import InputError
 from .cameras import PIXEL, POINT, SIZE, apart, camera, pixels
 from .test_wcs import folded
 
+pytestmark = pytest.mark.plugins
+
 LIMIT = 1e-8  # pixels
 
 

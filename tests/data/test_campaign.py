@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bayesdist.data import MagnitudeErrors, Matches, ReferenceCatalog, read_hst1pass, read_matchup
+from bayesdist.data import MagnitudeErrors, Matches, ReferenceCatalog
 from bayesdist.data.detections import Detections
 from bayesdist.data.exposures import Exposure, ExposureLog
 from bayesdist.data.matching.campaign import match_campaign
@@ -15,6 +15,7 @@ from bayesdist.data.matching.similarity import mismatch_reason, pattern_index
 from bayesdist.data.preparing import neutralise_aberration
 from bayesdist.data.starlists import StarCuts, read_star_lists
 from bayesdist.errors import InputError
+from bayesdist.formats.hst1pass import read_hst1pass, read_matchup
 from tests.data.sky import ZERO_POINT, campaign, positions, start
 from tests.reduced import case_in_full, only_in_full
 

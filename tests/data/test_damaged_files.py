@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
-from bayesdist.data import Matches, read_catalog, read_matches, read_matchup
+from bayesdist.data import Matches, read_catalog, read_matches
 from bayesdist.errors import InputError
+from bayesdist.formats.hst1pass import read_matchup
 
 
 def outcome(read, path):

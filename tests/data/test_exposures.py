@@ -85,7 +85,7 @@ def test_aberration_is_filled_in_only_where_it_is_missing():
         ({"exposure": ["a", "b"]}, "no column for 'epoch'"),
         (
             {"exposure": ["a", "b"], "epoch": [2004.0, 2005.0], "vafactor": [1.0, 5.0]},
-            r"row 2, exposure b: VAFACTOR is 5\.0",
+            r"row 2, exposure b: vafactor is 5\.0",
         ),
         (
             {"exposure": ["a", "b"], "epoch": [2004.0, 2005.0], "ra": ["", "east"]},

@@ -10,11 +10,10 @@ from bayesdist.data import (
     ReferenceCatalog,
     match_table,
     match_to_catalog,
-    read_hst1pass,
     read_matches,
-    read_matchup,
 )
 from bayesdist.errors import InputError
+from bayesdist.formats.hst1pass import read_hst1pass, read_matchup
 
 SHIFT = np.array([137.3, -55.1])
 

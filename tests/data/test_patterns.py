@@ -5,9 +5,9 @@ import time
 import numpy as np
 import pytest
 
-from bayesdist.data import read_matchup
 from bayesdist.data.matching.similarity import find_similarity, pattern_index
 from bayesdist.errors import InputError
+from bayesdist.formats.hst1pass import read_matchup
 from tests.data.sky import frame, positions
 
 N, SIDE = 50_000, 10_000.0

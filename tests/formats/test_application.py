@@ -360,7 +360,7 @@ def test_what_is_no_subarray_is_refused(tmp_path):
 def test_what_cannot_be_applied_is_refused(real, wfc):
     with pytest.raises(InputError, match="the scale is 0"):
         OutputFrame(0.0)
-    with pytest.raises(InputError, match="VAFACTOR is -1"):
+    with pytest.raises(InputError, match="aberration factor is -1"):
         OutputFrame(0.05, vafactor=-1.0)
     with pytest.raises(InputError, match="the origin"):
         OutputFrame(0.05, (np.nan, 0.0))

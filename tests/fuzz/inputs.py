@@ -18,9 +18,9 @@ from tests.app.rvb_jobs import rvb_job, rvb_pairs, write_rvb_table
 from tests.app.selfcal.support import commanded, list_table, small, write_selfcal
 from tests.app.support import as_table, good, simulated, write_config, write_job
 from tests.app.test_plan_patterns import SMALL
-from tests.data.test_hst1pass import LIST
 from tests.formats.test_ast import gbdes_table
 from tests.formats.test_formats import OPTIONS, SETTINGS, calibration_for
+from tests.formats.test_hst1pass import LIST
 from tests.formats.test_lookup_files import table as lookup_table
 from tests.fuzz.settings import CAMPAIGN, MATCHED, REQUIREMENTS
 from tests.missions.wise.test_bringup import write_lists

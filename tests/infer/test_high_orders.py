@@ -12,6 +12,8 @@ from bayesdist.infer.solution.linear import NO_REJECTION
 from bayesdist.products.common.document import BuildOptions
 from bayesdist.products.registry import build, product_settings, read_calibration
 
+pytestmark = pytest.mark.plugins
+
 ORDER = 12
 CHIP = bd.Chip(1, "MICADO", (2048.0, 2048.0), (1024.5, 1024.5))
 SIGMA = 0.005

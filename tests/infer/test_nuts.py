@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from numpy.polynomial.legendre import legvander2d
 
-from bayesdist.data import match_table, read_matches, read_matchup
+from bayesdist.data import match_table, read_matches
+from bayesdist.formats.hst1pass import read_matchup
 from bayesdist.infer import OutlierMixture, build_model, fit_by_magnitude, fit_linear, sample
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.simulate import simulate_matches

@@ -81,7 +81,7 @@ def inspect() -> None:
     show_default="0 0",
     help="Output pixel of the zero point.",
 )
-@click.option("--vafactor", type=float, default=1.0, metavar="V", help="VAFACTOR of the exposure.")
+@click.option("--vafactor", type=float, default=1.0, metavar="V", help="Factor of aberration.")
 @click.option("--sky", is_flag=True, help="To the sky: ra, dec with all errors that FILE carries.")
 @click.option(
     "--point", nargs=2, type=float, metavar="RA DEC", help="With --sky: position of u, v = 0."
@@ -104,7 +104,7 @@ def inspect() -> None:
 def apply(file: str, table: str, output: str, **options: Any) -> None:
     """Transform pixels to the undistorted frame, or back, or to the sky.
 
-    FILE is an IDCTAB, a run, or any file that 'compare' takes; TABLE has columns x, y, chip, or
+    FILE is a run, or any file that 'compare' takes; TABLE has columns x, y, chip, or
     x_out, y_out for the inverse.
     """
     sky_options = {key: options.pop(key) for key in ("point", "centroids", "joint")}
@@ -171,7 +171,9 @@ def convert() -> None:
 @click.option(
     "--chip", type=int, metavar="N", show_default="all common chips", help="Chip that is compared."
 )
-@click.option("--filter", metavar="F", help="Filter of IDCTABs, or WISE band; F:G for A and B.")
+@click.option(
+    "--filter", metavar="F", help="Filter or band of a file with several; F:G for A and B."
+)
 @epoch
 @image_size
 @click.option(

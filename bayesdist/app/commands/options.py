@@ -239,7 +239,7 @@ seed = click.option(
 epoch = click.option(
     "--epoch", type=float, metavar="T", help="Date in decimal years, for calibrations that drift."
 )
-filter_name = click.option("--filter", metavar="F", help="Filter of an IDCTAB, or WISE band.")
+filter_name = click.option("--filter", metavar="F", help="Filter or band of a file with several.")
 pixel_scale = click.option(
     "--scale", type=float, metavar="S", help="Size of a corrected pixel, arcsec."
 )

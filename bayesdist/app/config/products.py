@@ -30,7 +30,7 @@ FileNamePart = Annotated[str, AfterValidator(_as_part)]
 
 
 class PeriodBlock(Section):
-    """Years of validity of one IDCTAB, and the segment of the drift that it contains."""
+    """Years of validity of one file, and the segment of the drift that it contains."""
 
     name: FileNamePart
     years: tuple[float, float]
@@ -40,14 +40,15 @@ class PeriodBlock(Section):
 
 
 class ReleaseBlock(Section):
-    """IDCTABs, D2IMFILE and NPOLFILE, with V2 and V3 oriented as in an existing IDCTAB."""
+    """Files for several filters and periods, oriented as an existing file; see `ReleaseSet`."""
 
     name: FileNamePart
     reference: str
     period: Annotated[list[PeriodBlock], Field(min_length=1)]
-    instrument: str = "ACS"
-    detector: str = "WFC"
-    scale_arcsec: PositiveFloat = 0.05
+    # None: the values of the mission that releases the files
+    instrument: str | None = None
+    detector: str | None = None
+    scale_arcsec: PositiveFloat | None = None
     limit_mas: PositiveFloat = 0.1
 
 

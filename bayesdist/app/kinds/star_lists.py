@@ -11,12 +11,12 @@ import numpy as np
 
 from bayesdist.app.config.campaign import StarListsBlock
 from bayesdist.calibration.calibration import Calibration
+from bayesdist.calibration.plane import ARCSEC
 from bayesdist.data import Detections, StarCuts, read_star_lists
 from bayesdist.errors import InputError
-from bayesdist.formats.idctab.calibration import idctab_calibration
-from bayesdist.formats.idctab.table import IdcTab, read_idctab
 from bayesdist.infer.selfcal.prior import Start
 from bayesdist.model import Chip
+from bayesdist.products.common.document import Choice, Document
 from bayesdist.utils.arrays import Bool, Float, Int
 
 OFF_CHIP = 0.02  # fraction of a list's detections tolerated beyond the edge of a chip
@@ -138,17 +138,21 @@ def _refuse_off_chip(x: Float, y: Float, chip: Chip, where: str) -> None:
         )
 
 
-def known_calibration(tab: IdcTab | Path, filter: str | None) -> Calibration:
-    """Calibration of an IDCTAB in a filter, or without a filter if it does not list that one."""
-    table = read_idctab(tab) if isinstance(tab, Path) else tab
-    names = {name for row in table.filters() for name in row}
-    return idctab_calibration(table, filter if filter in names else None)
+def known_calibration(document: Document, filter: str | None) -> Calibration:
+    """Calibration of a file in a filter, or without a filter if it does not list that one."""
+    return document.calibration(Choice(filter if filter in document.filters() else None))
 
 
-def start_of(tab: IdcTab | Path, unit_arcsec: float, filter: str | None = None) -> Start:
-    """Distortion of an IDCTAB in the given unit of u and v, up to rotation and shift."""
-    calibration = known_calibration(tab, filter)
-    return lambda x, y, chip: calibration.forward(x, y, chip=chip) / unit_arcsec
+def start_of(calibration: Calibration, unit_arcsec: float) -> Start:
+    """Distortion of a calibration in the given unit of u and v, up to rotation and shift."""
+    if calibration.unit not in ARCSEC:
+        raise InputError(
+            f"states positions in {calibration.unit}, and an initial distortion is in angles",
+            where=calibration.name,
+            do="give a calibration whose positions are in arcsec or deg",
+        )
+    factor = ARCSEC[calibration.unit] / unit_arcsec
+    return lambda x, y, chip: calibration.forward(x, y, chip=chip) * factor
 
 
 def positions_by_chip(start: Start, x: Float, y: Float, chip: Int) -> Float:

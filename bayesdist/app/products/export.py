@@ -18,8 +18,8 @@ from bayesdist.app.products.made_files import (
     further_errors,
     made_files,
     product_of,
-    write_files,
 )
+from bayesdist.app.products.release_set import release_set
 from bayesdist.assess.budget import with_product
 from bayesdist.assess.evaluation import Evaluation
 from bayesdist.assess.terms.forms import PRODUCT
@@ -28,8 +28,8 @@ from bayesdist.data.sky import sky_of_plane
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.diagnose.residuals.stars import StarSample, star_sample
 from bayesdist.files.atomic import atomic_path, path_within
-from bayesdist.formats.sip.positions import sky_of_header
 from bayesdist.infer import Posterior
+from bayesdist.products.common.celestial import sky_of_header
 from bayesdist.products.registry import format_of, lint
 from bayesdist.utils.limits import FILE_ERROR, SKY_CLOSURE
 
@@ -86,7 +86,7 @@ def export(
         held = config.tables.detector is not None
         tables = published_tables(data.fitted.tables, held=held)
         number, solutions = config.chips()[0].number, {data.matched.filter: product.solution}
-        products += write_files(release, number, base, folder, solutions, tables)
+        products += release_set().write(release, number, base, folder, solutions, tables, ())
     facts = None if found is None or found.correlated is None else found.correlated.facts
     calibration = replace(product.calibration, further=further_errors(budget, facts))
     product = replace(product, calibration=calibration)

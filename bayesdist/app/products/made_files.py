@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 
 from bayesdist.app.config import Config
-from bayesdist.app.config.products import ReleaseBlock
 from bayesdist.app.kinds.fit_data import FitData, assessment_epoch
 from bayesdist.app.kinds.fitted import Fitted
 from bayesdist.app.kinds.kind import kind_of
 from bayesdist.app.kinds.matched import Outline
+from bayesdist.app.products.release_set import release_set
 from bayesdist.assess.budget import TOTAL
 from bayesdist.assess.model import with_diagnosed_errors
 from bayesdist.assess.terms.correlated import DEVIATIONS, STRUCTURE, STRUCTURE_IN_FIT
@@ -30,17 +30,14 @@ from bayesdist.assess.terms.parameters import (
 )
 from bayesdist.calibration.calibration import Calibration, GaussianSolution, calibration_of
 from bayesdist.calibration.chip_map import FurtherError
-from bayesdist.calibration.orientation import lay_on
 from bayesdist.calibration.plane import ARCSEC, Plane
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.infer import Posterior
 from bayesdist.infer.selfcal.prior import fitted_polynomials, undistorted
 from bayesdist.infer.solution.solution import Solution
-from bayesdist.infer.solution.transforms import reference_gauge, without_frames
 from bayesdist.model import LookupTable
-from bayesdist.products import Period, read_calibration, write_release
 from bayesdist.products.common.document import BuildOptions, Built
-from bayesdist.products.registry import build, lint
+from bayesdist.products.registry import build
 
 # rows of a budget that are included in the covariance of the exported solution, or in another row
 IN_COVARIANCE = (
@@ -172,7 +169,8 @@ def rehearse_outline(outline: Outline, config: Config, base: Path, source: str) 
     if release is not None:
         number = config.chips()[0].number
         with TemporaryDirectory() as nowhere:
-            write_files(release, number, base, Path(nowhere), {filter: solution}, tables)
+            write = release_set().write
+            write(release, number, base, Path(nowhere), {filter: solution}, tables, ())
 
 
 def solution_of(posterior: Posterior, found: Diagnostics | None, fitted: Fitted) -> Posterior:
@@ -196,77 +194,3 @@ def made_files(product: ProductInput, config: Config) -> dict[str, tuple[Built, 
         key: build(key, product.calibration, settings, product.options)
         for key, settings in config.products.asked().items()
     }
-
-
-def write_files(
-    block: ReleaseBlock,
-    chip: int,
-    base: Path,
-    folder: Path,
-    solutions: Mapping[str, Solution],
-    tables: Sequence[LookupTable],
-    history: Sequence[str] = (),
-) -> list[dict[str, Any]]:
-    """Write the files of a release for one or several filters, as configured by one run.
-
-    Parameters
-    ----------
-    block : ReleaseBlock
-    chip : int
-        Chip that defines the gauge by its axes and zero point.
-    base : Path
-        Folder that file names in the configuration are relative to.
-    folder : Path
-        Folder to write to.
-    solutions : mapping of str to Solution
-        Solutions by filter.  The first one must be that of the configuration: V2 and V3 are
-        oriented as the reference states for it.
-    tables : sequence of LookupTable
-    history : sequence of str
-        Lines for HISTORY in all files.
-
-    Returns
-    -------
-    list of dict
-        One entry per file: path, kind, findings and, for an IDCTAB, period and lost.
-    """
-    calibrations = {
-        filter: calibration_of(
-            reference_gauge(without_frames(solution), chip), filter, filter=filter
-        )
-        for filter, solution in solutions.items()
-    }
-    first = next(iter(calibrations.values()))
-    time = first.model.time
-    orientation = lay_on(
-        first,
-        read_calibration(base / block.reference),
-        chip=chip,
-        epoch=None if time is None else time.epoch0[0],
-        scale_arcsec=block.scale_arcsec,
-    )
-    written = write_release(
-        folder,
-        block.name,
-        calibrations,
-        orientation,
-        [Period(**row.model_dump()) for row in block.period],
-        tables=tables,
-        instrument=block.instrument,
-        detector=block.detector,
-        scale_arcsec=block.scale_arcsec,
-        limit_mas=block.limit_mas,
-        history=history,
-    )
-    out: list[dict[str, Any]] = []
-    for period, path in written.idctabs.items():
-        lost = [asdict(row) for row in written.lost.get(period, ())]
-        out.append(_entry(path, "IDCTAB") | {"period": period, "lost": lost})
-    lookup_files = [] if written.d2im is None else [("D2IMFILE", written.d2im)]
-    lookup_files += [("NPOLFILE", path) for path in written.npol.values()]
-    return out + [_entry(path, kind) for kind, path in lookup_files]
-
-
-def _entry(path: Path, kind: str) -> dict[str, Any]:
-    findings = [f"{f.level}: {f.where}: {f.message}" for f in lint(path)]
-    return {"path": path.name, "kind": kind, "findings": findings}

@@ -1,17 +1,16 @@
 """Differences between products as written and the solution of their run.
 
 Each format reads its files back (`read_back`).  A SIP header holds one chip at one date: drift to
-other dates and look-up tables are always left out.  An IDCTAB has axes and a pixel of its own: the
-best-fitting shift, rotation and (common to all dates) scale are removed; the look-up tables of a
-released set are applied as well.  An inverse is compared with the forward terms of its own file,
-because users transform back and forth with the same file.
+other dates and look-up tables are always left out.  Some formats have axes and a pixel of their
+own: the best-fitting shift, rotation and (common to all dates) scale are removed; the look-up
+tables of a released set are applied as well.  An inverse is compared with the forward terms of its
+own file, because users transform back and forth with the same file.
 """
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -19,18 +18,17 @@ import numpy as np
 
 from bayesdist.app.config import Config
 from bayesdist.app.config.products import ReleaseBlock
-from bayesdist.app.products.made_files import ProductInput, made_files, write_files
+from bayesdist.app.products.made_files import ProductInput, made_files
+from bayesdist.app.products.release_set import first_segments, release_set
 from bayesdist.assess.solution import place_of
 from bayesdist.assess.terms.forms import MEASURED, PRODUCT, Known, Row
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.plane import ARCSEC
 from bayesdist.errors import BayesdistError
-from bayesdist.formats.lookup.d2im import read_d2im
-from bayesdist.formats.lookup.file import read_lookup_file
 from bayesdist.model import corrected
 from bayesdist.model.grid import grid_pixels, mesh
 from bayesdist.products.common.read_back import Positions, ReadBack, by_calibrations
-from bayesdist.products.registry import read_back, read_calibration
+from bayesdist.products.registry import read_back
 from bayesdist.utils.arrays import Float
 
 log = logging.getLogger("bayesdist")
@@ -90,26 +88,12 @@ def _released(
 ) -> list[Calibration]:
     """Calibrations of a release, one per segment; of several periods of a segment the first."""
     filter = product.calibration.filter
+    release = release_set()
     solutions = {filter: product.solution}
-    entries = write_files(block, number, base, folder, solutions, product.options.tables)
-    paths = {e["kind"]: folder / e["path"] for e in entries}
-    before = read_d2im(paths["D2IMFILE"]) if "D2IMFILE" in paths else ()
-    npol = read_lookup_file(paths["NPOLFILE"]) if "NPOLFILE" in paths else None
-    sets = {}
-    for entry in entries:
-        if entry["kind"] == "IDCTAB":
-            calibration = read_calibration(folder / entry["path"], filter=filter)
-            tables = [] if npol is None else [npol.table(chip) for chip in npol.chips]
-            pixel = calibration.pixel()[0]
-            after = [replace(table, values=pixel * table.values, sigma=None) for table in tables]
-            sets[entry["period"]] = replace(calibration, before=tuple(before), after=tuple(after))
-    segments: dict[int, Calibration] = {}
-    for period in block.period:
-        segments.setdefault(period.segment, sets[period.name])
+    entries = release.write(block, number, base, folder, solutions, product.options.tables, ())
     time = product.solution.model.time
-    n = 1 if time is None else time.n_segments
-    last = segments[min(segments)]
-    return [segments.get(k, last) for k in range(n)]
+    sets = release.calibrations(entries, folder, filter)
+    return first_segments(block, sets, 1 if time is None else time.n_segments)
 
 
 def _term(product: ProductInput, file: str, direction: str, shift: Positions) -> Known:

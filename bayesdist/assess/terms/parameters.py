@@ -109,7 +109,7 @@ class ScaleError:
     """A Gaussian error of scale or orientation about the reference pixel of the first chip.
 
     An example is velocity aberration that was not corrected, or that was corrected with an
-    inaccurate spacecraft velocity. It changes the scale: VAFACTOR differs from 1 by up to 1e-4.
+    inaccurate spacecraft velocity. It changes the scale by up to 1e-4.
 
     Raises InputError if the kind is unknown, or if sigma is negative or not finite.
     """

@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.data.formats.hst1pass import is_hst1pass, is_matchup
+from bayesdist.data.catalog import ReferenceCatalog
+from bayesdist.data.detections import Detections
 from bayesdist.data.matches import Matches
 from bayesdist.data.reading.columns import lacking_columns, present_columns
 from bayesdist.data.reading.table import own_epoch, with_sky_columns
@@ -34,7 +35,7 @@ from bayesdist.plugin import mission_objects
 PathLike = str | os.PathLike[str]
 # columns of astrometry.net correspondences (`corr.fits`): detections and their index stars
 CORR_COLUMNS = {"x": "field_x", "y": "field_y", "ra": "index_ra", "dec": "index_dec"}
-FORMATS = ("auto", "table", "bayesdist", "hst1pass", "matchup", "astrometry.net")
+FORMATS = ("auto", "table", "bayesdist", "astrometry.net")
 MAX_ROWS_READ = 200_000  # rows of a large table that are read to interpret its columns
 MAX_CHIPS = 200
 MIN_ROWS_ON_CHIP = 20  # rows; flags and qualities often have rarer values
@@ -43,19 +44,38 @@ SUFFIX = ".h5"
 
 @dataclass(frozen=True)
 class MatchFormat:
-    """Format of files of matches that a mission registers in `match_formats`.
+    """Format of files of matches or star lists that a mission registers in `match_formats`.
+
+    Files have matches (`read`), or raw and corrected positions of one exposure (`detections` and
+    `matches`), or are catalogues to which such lists are matched (`master` and `lists`).
 
     Parameters
     ----------
     recognizes : callable
         ``recognizes(path)`` is True if the file is of this format.
-    read : callable
+    read : callable, optional
         ``read(path)`` returns the matches as a table with column names and units that
         `read_matches` recognises.
+    detections : callable, optional
+        ``detections(path, name)`` returns the `Detections` of an exposure with this name.
+    matches : callable, optional
+        ``matches(path, name)`` returns the `Matches` of the detections with the corrected positions
+        of the same list, in pixels.
+    lacking : callable, optional
+        ``lacking(path)`` returns those of "u" and "v" that the list does not have.
+    master : callable, optional
+        ``master(path)`` returns a `ReferenceCatalog` in pixels.
+    lists : str
+        Name of the format of the lists that are matched to the master.
     """
 
     recognizes: Callable[[Path], bool]
-    read: Callable[[Path], Table]
+    read: Callable[[Path], Table] | None = None
+    detections: Callable[[Path, str], Detections] | None = None
+    matches: Callable[[Path, str | None], Matches] | None = None
+    lacking: Callable[[Path], list[str]] | None = None
+    master: Callable[[Path], ReferenceCatalog] | None = None
+    lists: str = ""
 
 
 def mission_formats() -> dict[str, MatchFormat]:
@@ -112,9 +132,10 @@ def _expanded(path: Path) -> list[Path]:
 
 def kind_of(file: Path, columns: Mapping[str, str] | None) -> str:
     """Format of a file: one registered by a mission, or else by its name and then its content."""
+    formats = mission_formats()
     if columns is None and file.is_file():
-        for key, format_ in mission_formats().items():
-            if format_.recognizes(file):
+        for key, format_ in formats.items():
+            if format_.read is not None and format_.recognizes(file):
                 return key
     name = without_codec(file.name)
     if name.endswith(tuple(TABLE_SUFFIXES)):
@@ -125,10 +146,9 @@ def kind_of(file: Path, columns: Mapping[str, str] | None) -> str:
     lines = [] if is_binary(file) else read_lines(file)
     if name.endswith(SUFFIX):
         return "bayesdist"
-    if is_matchup(lines):
-        return "matchup"
-    if is_hst1pass(file, lines):
-        return "hst1pass"  # the reader reports what is wrong
+    for key, format_ in formats.items():
+        if format_.read is None and format_.recognizes(file):
+            return key  # the reader reports what is wrong
     if is_text_table(lines) or is_fits(file):
         return "table"
     raise FormatError(

@@ -4,7 +4,7 @@ The known distortion projects raw positions to a plane. Triangles of bright star
 shift. A linear map is iterated while the search radius shrinks, and a cubic per chip fits the
 remaining distortion. Matches are mutual nearest neighbours within a radius that is derived from
 their distances. The transformations are used only for the matching: the results are raw pixels with
-catalogue positions (ACS ISR 2015-06, Section 4.1).
+catalogue positions (Kozhurina-Platais et al. (2015), Section 4.1).
 """
 
 from __future__ import annotations

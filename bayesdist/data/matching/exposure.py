@@ -3,7 +3,7 @@
 Search radius for pairs, derived from the distances of the pairs.
 
 In regions with a less well known distortion, usually the corners, pairs need a larger search radius
-than in the middle. A radius that is large everywhere includes false matches (the WISE distortion
+than in the middle. A radius that is large everywhere includes false matches (the distortion
 report, Section 3, item 1: criteria that depend on the radial distance from the centre).
 """
 

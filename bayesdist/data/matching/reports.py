@@ -192,7 +192,7 @@ def match_warnings(
 
     An exposure is an outlier if its completeness is far below that of the others, if far more of
     its matches are expected to be false, or if its scale differs. The scale is corrected for
-    velocity aberration if the log has VAFACTOR. The thresholds are five robust standard deviations
+    velocity aberration if the log has it. The thresholds are five robust standard deviations
     of all exposures, and at least 0.15, 0.05 and 2e-5.
     """
     out = []

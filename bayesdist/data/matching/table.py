@@ -176,7 +176,7 @@ def match_table(
     ----------
     table : Matches
         Matches with u, v as approximate corrected positions in the catalogue's unit, as given by
-        hst1pass.
+        a program for photometry.
     catalog : ReferenceCatalog
         Catalogue, which is moved to the mean epoch of each exposure if it has proper motions.
     radius, max_offset

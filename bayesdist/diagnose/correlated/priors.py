@@ -37,10 +37,10 @@ class DiscrepancyPriors:
     """Prior medians of the discrepancy's amplitudes.
 
     The defaults are far below the residuals of published calibrations (0.01 to 0.03 pixels rms in
-    ACS ISR 2015-06 after its look-up tables, 0.02 in the WISE partition pattern of WSDC D-T033,
-    scale changes of some 1e-5 between exposures for HST).  The tail of the distribution includes
-    such values, but its bulk does not increase the errors of a calibration without a visible
-    discrepancy.
+    Kozhurina-Platais et al. 2015 after its look-up tables, 0.02 in the partition pattern of
+    WSDC D-T033, scale changes of some 1e-5 between exposures for HST).  The tail of the
+    distribution includes such values, but its bulk does not increase the errors of a calibration
+    without a visible discrepancy.
 
     Parameters
     ----------

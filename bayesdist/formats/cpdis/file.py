@@ -20,12 +20,12 @@ from bayesdist.calibration.calibration import Calibration, calibration_of_maps
 from bayesdist.calibration.chip_map import ChipMap, fitted_map
 from bayesdist.calibration.plane import ARCSEC, Plane
 from bayesdist.errors import FormatError, InputError
-from bayesdist.formats.lookup.plane import Plane as TablePlane
-from bayesdist.formats.sip.read import cd_matrix, image_size
 from bayesdist.model import LookupTable
 from bayesdist.products.common.celestial import TangentForm, refuse_singular, tangent_form
 from bayesdist.products.common.content import Content, Hdu
 from bayesdist.products.common.document import Choice, required_size
+from bayesdist.products.common.linear_wcs import cd_matrix, image_size
+from bayesdist.products.common.lookup_plane import Plane as TablePlane
 from bayesdist.products.common.parameters import (
     largest_difference,
     refuse_changed,

@@ -19,7 +19,6 @@ from bayesdist.formats.cpdis.file import (
     cpdis_of,
 )
 from bayesdist.formats.cpdis.lint import lint_cpdis
-from bayesdist.formats.sip.format import describe_wcs
 from bayesdist.model import LookupTable
 from bayesdist.products.common.cards import (
     append_cards,
@@ -35,6 +34,7 @@ from bayesdist.products.common.coefficients import require_regular
 from bayesdist.products.common.content import fits_bytes
 from bayesdist.products.common.document import BuildOptions, Built, Format, FormatSettings
 from bayesdist.products.common.parameters import parameters_hdu
+from bayesdist.products.common.wcs_text import describe_wcs
 from bayesdist.utils.arrays import Float
 
 _CLOSE = 1e-4  # pixels; target error between nodes if no step is requested

@@ -14,13 +14,13 @@ from bayesdist.formats.cpdis.file import (
     CpdisImage,
     cpdis_calibration,
 )
-from bayesdist.formats.lookup.plane import Plane
 from bayesdist.products.common.document import (
     Choice,
     Finding,
     MissingSizeError,
     of_part,
 )
+from bayesdist.products.common.lookup_plane import Plane
 
 _TINY = 1e-3  # pixels; if all shifts are smaller, the table is probably in another unit
 _ASKEW = 0.75  # steps; half the difference between the margins at both ends that is reported

@@ -8,10 +8,12 @@ from pydantic import PositiveFloat
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.formats.idctab.build import idctab_from_solution
 from bayesdist.formats.idctab.calibration import idctab_calibration
+from bayesdist.formats.idctab.columns import idctab_column
+from bayesdist.formats.idctab.hst import parity_of
 from bayesdist.formats.idctab.lint import lint_idctab
 from bayesdist.formats.idctab.plausible import LIMITS
 from bayesdist.formats.idctab.table import FILTER_COLUMNS, HIGHEST, IdcTab
-from bayesdist.products.common.coefficients import idctab_column, largest_magnitude
+from bayesdist.products.common.coefficients import largest_magnitude
 from bayesdist.products.common.content import Content
 from bayesdist.products.common.document import (
     BuildOptions,
@@ -166,4 +168,6 @@ FORMAT = Format(
     highest_order=HIGHEST,
     holds_time=True,
     asks=("filter",),
+    filters=lambda tab: {name for row in tab.filters() for name in row},
+    mirrored=lambda tab: bool(np.prod(parity_of(tab.instrument, tab.detector)) < 0),
 )

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.errors import InputError
+from bayesdist.formats.idctab.columns import idctab_column, idctab_powers
 from bayesdist.formats.idctab.hst import parity_of
 from bayesdist.formats.idctab.plausible import implausible, rows_text
 from bayesdist.formats.idctab.table import FILTER_COLUMNS, IdcTab
-from bayesdist.products.common.coefficients import idctab_column, idctab_powers
 from bayesdist.products.common.document import Finding, missing_identity, repeated_values
 
 _SCALE_RATIO = 1.25

@@ -31,11 +31,12 @@ from astropy.io import fits
 from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.errors import FormatError, InputError
+from bayesdist.formats.idctab.columns import idctab_column
 from bayesdist.formats.idctab.drift import drift, scheme_of
 from bayesdist.formats.idctab.hst import serves
 from bayesdist.model import polynomial_terms
 from bayesdist.products.common.cards import named_in
-from bayesdist.products.common.coefficients import evaluate, idctab_column
+from bayesdist.products.common.coefficients import evaluate
 from bayesdist.products.common.content import Hdu, read_hdus, write_hdus
 from bayesdist.utils.arrays import Float, Int
 

@@ -24,10 +24,10 @@ import numpy as np
 from astropy.io import fits
 
 from bayesdist.errors import FormatError, InputError
-from bayesdist.formats.lookup.plane import Plane
 from bayesdist.model.lookup import LookupTable
 from bayesdist.products.common.cards import named_in
 from bayesdist.products.common.content import Hdu, read_hdus, write_hdus
+from bayesdist.products.common.lookup_plane import Plane
 from bayesdist.utils.arrays import Float
 
 AXES = ("DX", "DY")

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from bayesdist.formats.lookup.file import AXES, LookupFile
+from bayesdist.formats.lookup.file import AXES, LookupFile, check_kind
 from bayesdist.formats.lookup.lint import lint_lookup_file
+from bayesdist.model import LookupTable
 from bayesdist.products.common.content import Content
 from bayesdist.products.common.document import Format, finding_lines, identity_lines
 
@@ -56,4 +57,18 @@ def _describe(file: LookupFile) -> list[str]:
     return [*lines, "", *finding_lines(lint_lookup_file(file))]
 
 
-FORMAT = Format("lookup", "a D2IMFILE or NPOLFILE", 3, _parse, _describe, lint_lookup_file)
+def _tables(file: LookupFile) -> tuple[LookupTable, ...]:
+    """Look-up tables of the detector."""
+    check_kind(file, "d2im")
+    return tuple(file.table(chip) for chip in file.chips)
+
+
+FORMAT = Format(
+    "lookup",
+    "a D2IMFILE or NPOLFILE",
+    3,
+    _parse,
+    _describe,
+    lint_lookup_file,
+    tables=_tables,
+)

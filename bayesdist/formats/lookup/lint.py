@@ -9,8 +9,8 @@ import numpy as np
 
 from bayesdist.errors import FormatError
 from bayesdist.formats.lookup.file import AXES, LookupFile
-from bayesdist.formats.lookup.plane import Plane
 from bayesdist.products.common.document import Finding, missing_identity
+from bayesdist.products.common.lookup_plane import Plane
 
 _PLACE = ("CRPIX1", "CRPIX2", "CRVAL1", "CRVAL2")
 

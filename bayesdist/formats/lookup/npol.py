@@ -14,11 +14,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bayesdist.errors import DegenerateError, FormatError, InputError
-from bayesdist.formats.idctab.table import IdcTab
 from bayesdist.formats.lookup.build import (
     Part,
     lookup_file,
@@ -37,11 +38,50 @@ from bayesdist.products.common.coefficients import evaluate
 from bayesdist.utils.arrays import Float
 
 
+class PolynomialTable(Protocol):
+    """Table with the polynomials of the chips, such as an `IdcTab`, as far as it is used."""
+
+    @property
+    def name(self) -> str:
+        """Name of the file, for error messages."""
+
+    @property
+    def instrument(self) -> str:
+        """INSTRUME."""
+
+    @property
+    def detector(self) -> str:
+        """DETECTOR."""
+
+    @property
+    def stated_chips(self) -> tuple[int, ...]:
+        """Chip numbers; empty if the rows are valid for every chip."""
+
+    @property
+    def terms(self) -> tuple[tuple[int, int], ...]:
+        """Powers of x and y of the coefficients."""
+
+    @property
+    def rows(self) -> NDArray[np.void]:
+        """Rows with XSIZE, YSIZE, XREF, YREF and SCALE."""
+
+    def row(self, chip: int, filter: tuple[str, ...] | None = None) -> int:
+        """Index of the row of a chip and filter."""
+
+    def coefficients_of_row(self, row: int) -> tuple[Float, Float]:
+        """Coefficients of Xc and Yc."""
+
+    def evaluate(
+        self, chip: int, x: Float, y: Float, *, filter: tuple[str, ...] | None = None
+    ) -> tuple[Float, Float]:
+        """Xc and Yc at the reference date."""
+
+
 def write_npol(
     tables: Sequence[LookupTable],
     path: str | os.PathLike[str],
     *,
-    idctab: IdcTab,
+    idctab: PolynomialTable,
     filters: Sequence[str],
     description: str = "Filter-dependent distortion with its uncertainty, by bayesdist",
     useafter: str | None = None,
@@ -57,7 +97,7 @@ def write_npol(
         the IDCTAB without a table gets zeros, because stwcs stops if a table is missing.
     path : path-like
         Output file. Pipelines expect a name that ends in ``_npl.fits``.
-    idctab : IdcTab
+    idctab : PolynomialTable
         IDCTAB with the polynomial that the file will be used with.
     filters : sequence of str
         FILTER1 and FILTER2 (ACS), or FILTER alone. They select the row of the IDCTAB.
@@ -152,7 +192,7 @@ def write_npol(
 
 def read_npol(
     path: str | os.PathLike[str],
-    idctab: IdcTab,
+    idctab: PolynomialTable,
     *,
     first: Sequence[float] | None = None,
 ) -> tuple[LookupTable, ...]:
@@ -162,7 +202,7 @@ def read_npol(
     ----------
     path : path-like
         NPOLFILE.
-    idctab : IdcTab
+    idctab : PolynomialTable
         IDCTAB with the polynomial that the file is used with.
     first : sequence of float, optional
         Pixel (x, y) of the first node, as in `read_d2im`.
@@ -223,7 +263,7 @@ def _one_name(filters: Sequence[str]) -> str:
 class _Local:
     """Polynomial of one chip and its derivatives, in units of SCALE."""
 
-    def __init__(self, idctab: IdcTab, chip: int, filters: Sequence[str]) -> None:
+    def __init__(self, idctab: PolynomialTable, chip: int, filters: Sequence[str]) -> None:
         self.idctab, self.chip, self.filters = idctab, chip, tuple(filters) or None
         row = idctab.row(chip, self.filters)
         record = idctab.rows[row]

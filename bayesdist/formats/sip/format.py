@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Annotated, Literal
 
 import numpy as np
@@ -10,7 +9,7 @@ from pydantic import Field
 
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.orientation import MAX_DEPARTURE, departure_from_tangent_plane
-from bayesdist.formats.sip.build import sip_from_solution
+from bayesdist.formats.sip.build import sip_from_solution, sip_wcs
 from bayesdist.formats.sip.calibration import (
     agreeing,
     side_file,
@@ -21,6 +20,7 @@ from bayesdist.formats.sip.header import SIDE_FILE, SIP_ORDERS, SipHeader
 from bayesdist.formats.sip.lint import lint_sip
 from bayesdist.formats.sip.positions import sip_read_back
 from bayesdist.formats.sip.read import holds_sip, sip_of
+from bayesdist.formats.sip.text import describe_sip
 from bayesdist.formats.sip.write import sip_text
 from bayesdist.products.common.cards import header_of
 from bayesdist.products.common.content import Content
@@ -48,14 +48,6 @@ class Settings(FormatSettings):
 
 def _parse(content: Content) -> Content | None:
     return content if holds_sip(content) else None
-
-
-def describe_wcs(content: Content, extra: Sequence[Finding] = ()) -> list[str]:
-    """Lines of text on each world coordinate system of a file, and `extra` findings."""
-    # importing astropy.wcs takes longer than reading most files
-    from bayesdist.formats.sip.wcs_text import describe_wcs as lines_on
-
-    return lines_on(content, extra)
 
 
 def _lint(content: Content) -> tuple[Finding, ...]:
@@ -176,7 +168,7 @@ FORMAT = Format(
     "a SIP header",
     1,
     _parse,
-    describe_wcs,
+    describe_sip,
     _lint,
     _calibration,
     Settings,
@@ -185,4 +177,5 @@ FORMAT = Format(
     highest_order=SIP_ORDERS[1],
     needs_scale=lambda settings: settings.axes != "linear",
     asks=("size",),
+    fits_wcs=sip_wcs,
 )

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from astropy.io import fits
 
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.plane import ARCSEC, arcsec_per
@@ -14,6 +12,7 @@ from bayesdist.data.sky import tangent_plane
 from bayesdist.formats.sip.header import SipHeader
 from bayesdist.formats.sip.read import sip_of
 from bayesdist.formats.sip.write import sip_header
+from bayesdist.products.common.celestial import sky_of_header
 from bayesdist.products.common.content import Content
 from bayesdist.products.common.document import PARAMETERS, BuildOptions, Built
 from bayesdist.products.common.read_back import ReadBack
@@ -45,16 +44,6 @@ def sip_positions(
     in_unit = 3600.0 / arcsec_per(unit, scale_arcsec)
     offset = stated.offset or (0.0, 0.0)
     return np.stack(sip.forward(x, y), axis=-1) @ (in_unit * stated.cd).T + offset
-
-
-def sky_of_header(header: fits.Header, x: Float, y: Float) -> tuple[Float, Float]:
-    """RA and Dec (N,) in degrees of FITS 1-based pixels, computed by astropy.wcs."""
-    from astropy.wcs import WCS, FITSFixedWarning
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", FITSFixedWarning)
-        ra, dec = WCS(header).all_pix2world(x, y, 1)
-    return np.asarray(ra), np.asarray(dec)
 
 
 def sip_read_back(

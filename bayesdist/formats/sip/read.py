@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 
-import numpy as np
 from astropy.io import fits
 
 from bayesdist.errors import FormatError, InputError
@@ -13,14 +12,7 @@ from bayesdist.products.common.cards import card_images
 from bayesdist.products.common.celestial import refuse_oversized
 from bayesdist.products.common.coefficients import sip_powers
 from bayesdist.products.common.content import Content, read_content, readable
-from bayesdist.utils.arrays import Float
-
-CD_KEYWORDS = ("CD1_1", "CD1_2", "CD2_1", "CD2_2")
-# Keywords that other headers have instead of a CD matrix.
-LINEAR_KEYWORDS = (
-    *("PC1_1", "PC1_2", "PC2_1", "PC2_2"),
-    *("CDELT1", "CDELT2", "CROTA1", "CROTA2"),
-)
+from bayesdist.products.common.linear_wcs import cd_matrix, finite_number, image_size
 
 
 def read_sip(path: str | os.PathLike[str], *, ext: int | str | None = None) -> SipHeader:
@@ -118,12 +110,15 @@ def _parsed(header: fits.Header, where: str) -> SipHeader:
     for keyword in header:
         powers = sip_powers(keyword)
         if powers is not None:
-            terms[powers[0]][powers[1:]] = _number(header, keyword, where)
+            terms[powers[0]][powers[1:]] = finite_number(header, keyword, where)
     inverse = "AP_ORDER" in header or "BP_ORDER" in header
     offset = "BDU0" in header
     return SipHeader(
-        crpix=(_number(header, "CRPIX1", where), _number(header, "CRPIX2", where)),
-        crval=(_number(header, "CRVAL1", where, 0.0), _number(header, "CRVAL2", where, 0.0)),
+        crpix=_pair(header, "CRPIX1", "CRPIX2", where),
+        crval=(
+            finite_number(header, "CRVAL1", where, 0.0),
+            finite_number(header, "CRVAL2", where, 0.0),
+        ),
         cd=cd_matrix(header, where),
         ctype=(str(header.get("CTYPE1", "")), str(header.get("CTYPE2", ""))),
         order=(_order(header, "A_ORDER", where), _order(header, "B_ORDER", where)),
@@ -138,32 +133,31 @@ def _parsed(header: fits.Header, where: str) -> SipHeader:
         sigma_b=terms["BE"],
         dmax=(_optional(header, "A_DMAX", where), _optional(header, "B_DMAX", where)),
         closure=_optional(header, "BDCLOS", where),
-        offset=(_number(header, "BDU0", where), _number(header, "BDV0", where)) if offset else None,
+        offset=(finite_number(header, "BDU0", where), finite_number(header, "BDV0", where))
+        if offset
+        else None,
         unit=str(header.get("BDUNIT", "")),
         size=image_size(header),
         cards=card_images(header),
     )
 
 
-def _number(header: fits.Header, keyword: str, where: str, default: float | None = None) -> float:
-    value = header.get(keyword, default)
-    if value is None:
-        raise FormatError("is missing", where=f"{where}, keyword {keyword}", do="add the keyword")
-    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
-        raise FormatError(
-            f"value {value!r} is no finite number",
-            where=f"{where}, keyword {keyword}",
-            do="correct the value",
-        )
-    return float(value)
+def _pair(
+    header: fits.Header, first: str, second: str, where: str, default: float | None = None
+) -> tuple[float, float]:
+    """Values of two keywords."""
+    return (
+        finite_number(header, first, where, default),
+        finite_number(header, second, where, default),
+    )
 
 
 def _optional(header: fits.Header, keyword: str, where: str) -> float | None:
-    return _number(header, keyword, where) if keyword in header else None
+    return finite_number(header, keyword, where) if keyword in header else None
 
 
 def _order(header: fits.Header, keyword: str, where: str) -> int:
-    value = _number(header, keyword, where)
+    value = finite_number(header, keyword, where)
     if value != int(value) or value < 0:
         raise FormatError(
             f"polynomial order is {value:g}",
@@ -171,38 +165,3 @@ def _order(header: fits.Header, keyword: str, where: str) -> int:
             do="give a whole number",
         )
     return int(value)
-
-
-def cd_matrix(header: fits.Header, where: str) -> Float:
-    """CD matrix (2, 2), also from PC and CDELT or from CROTA2 (FITS 4.0, section 8.1).
-
-    As in wcslib, CD takes precedence over PC, and PC over CROTA2.
-    """
-    if any(keyword in header for keyword in CD_KEYWORDS):
-        return np.array([_number(header, k, where, 0.0) for k in CD_KEYWORDS]).reshape(2, 2)
-    scale = np.array([_number(header, k, where, 1.0) for k in ("CDELT1", "CDELT2")])
-    if "CROTA2" in header and not any(keyword in header for keyword in LINEAR_KEYWORDS[:4]):
-        angle = np.deg2rad(_number(header, "CROTA2", where))
-        c, s = np.cos(angle), np.sin(angle)
-        return np.array([[scale[0] * c, -scale[1] * s], [scale[0] * s, scale[1] * c]])
-    pc = [
-        _number(header, k, where, d)
-        for k, d in zip(LINEAR_KEYWORDS[:4], (1.0, 0.0, 0.0, 1.0), strict=True)
-    ]
-    return scale[:, None] * np.array(pc).reshape(2, 2)
-
-
-def image_size(header: fits.Header) -> tuple[int, int] | None:
-    """Columns and rows stated in a header; a side of one pixel counts as a placeholder.
-
-    A compressed image is a table with its size in ZNAXIS. HST headers have NPIX if all pixels have
-    one value and there are no data.
-    """
-    pairs = [("ZNAXIS1", "ZNAXIS2"), ("IMAGEW", "IMAGEH"), ("NPIX1", "NPIX2")]
-    if "TABLE" not in str(header.get("XTENSION", "")):
-        pairs.insert(0, ("NAXIS1", "NAXIS2"))
-    for names in pairs:
-        n = [header.get(name, 0) for name in names]
-        if all(isinstance(k, int | float) and k > 1 for k in n):
-            return int(n[0]), int(n[1])
-    return None

@@ -2,13 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
+from astropy.io import fits
 
 from bayesdist.formats.sip.families import forward_is_used, inverse_is_used
 from bayesdist.formats.sip.header import SIP_ORDERS, SipHeader, worst_closure
+from bayesdist.formats.sip.lint import lint_sip
+from bayesdist.formats.sip.read import parsed
 from bayesdist.products.common.coefficients import sip_keyword
+from bayesdist.products.common.content import Content
+from bayesdist.products.common.document import DistortionText, Finding
+from bayesdist.products.common.wcs_text import describe_wcs
+
+# keywords that drizzling adds to its output image
+_DRIZZLED = ("NDRIZIM", "D001DATA", "D001SCAL", "D001PIXF")
+
+
+def describe_sip(content: Content, extra: Sequence[Finding] = ()) -> list[str]:
+    """Lines of text on each world coordinate system of a file, and `extra` findings."""
+
+    def distortion(header: fits.Header, name: str) -> DistortionText | None:
+        if "A_ORDER" not in header:
+            return None
+        sip = parsed(header, name)
+        findings = [*lint_sip(sip), *_left_over(header)]
+        return DistortionText(sip_lines(sip, name), coefficient_lines(sip), findings)
+
+    return describe_wcs(content, extra, distortion)
 
 
 def sip_lines(sip: SipHeader, name: str) -> list[str]:
@@ -67,3 +89,16 @@ def _term_lines(
         error = f"  +- {sigma[powers]:.3e}" if powers in sigma else ""
         out.append(f"  {sip_keyword(prefix, *powers):<7} {terms[powers]:21.13e}{error}")
     return out
+
+
+def _left_over(header: fits.Header) -> Iterator[Finding]:
+    """Finding on SIP coefficients in the header of a drizzled image, which has no distortion."""
+    drizzled = [key for key in _DRIZZLED if key in header]
+    if drizzled:
+        yield Finding(
+            "warning",
+            "A_ORDER, B_ORDER",
+            f"SIP coefficients beside {drizzled[0]}: the image was drizzled, which removes the "
+            "distortion, and the coefficients of an input image may be left over: they are "
+            "applied here; delete them if so",
+        )

@@ -9,7 +9,6 @@ from astropy.io import fits
 
 from bayesdist.files.atomic import atomic_path
 from bayesdist.formats.sip.header import SipHeader
-from bayesdist.formats.sip.read import CD_KEYWORDS, LINEAR_KEYWORDS, cd_matrix, image_size
 from bayesdist.products.common.cards import (
     ascii_card,
     header_of,
@@ -18,6 +17,7 @@ from bayesdist.products.common.cards import (
     text_card,
 )
 from bayesdist.products.common.coefficients import sip_keyword, sip_powers
+from bayesdist.products.common.linear_wcs import CD_KEYWORDS, LINEAR_KEYWORDS, cd_matrix, image_size
 
 _FITS_SUFFIXES = (".fits", ".fit", ".fts", ".fits.gz")
 _STRUCTURE = (

@@ -13,7 +13,6 @@ from bayesdist.calibration.inverse import detector_grid
 from bayesdist.calibration.orientation import placed_at, refuse_wide_planes
 from bayesdist.calibration.plane import arcsec_per
 from bayesdist.errors import InputError
-from bayesdist.formats.sip.format import describe_wcs
 from bayesdist.formats.tpv.head import (
     HIGHEST,
     SIDE_FILE,
@@ -44,6 +43,7 @@ from bayesdist.products.common.document import (
     finding_lines,
 )
 from bayesdist.products.common.parameters import parameters_content
+from bayesdist.products.common.wcs_text import describe_wcs
 
 NAME = "tpv.head"
 _GRID = 33  # points per axis over which CRDER is the rms error

@@ -23,11 +23,11 @@ from bayesdist.calibration.chip_map import ChipMap, fitted_map
 from bayesdist.calibration.inverse import detector_grid
 from bayesdist.calibration.plane import ARCSEC, Plane
 from bayesdist.errors import FormatError, InputError
-from bayesdist.formats.sip.read import cd_matrix, image_size
 from bayesdist.model import polynomial_terms
 from bayesdist.products.common.celestial import TangentForm, refuse_singular, tangent_form
 from bayesdist.products.common.content import Content, readable
 from bayesdist.products.common.document import Choice, required_size
+from bayesdist.products.common.linear_wcs import cd_matrix, image_size
 from bayesdist.products.common.parameters import with_parameters
 from bayesdist.utils.arrays import Float
 

@@ -1,8 +1,8 @@
 """Independent fits of all exposures in the reference gauge, and their linear terms against time.
 
-The method is that of ACS ISR 2015-06 (sections 4.2 and 4.4).  All chips of an exposure are fitted
-in the system of the catalogue, and the solution is rotated and shifted to the reference chip.  The
-linear terms of all exposures, with their covariances, form a time series.
+The method is that of Kozhurina-Platais et al. (2015, sections 4.2 and 4.4).  All chips of an
+exposure are fitted in the system of the catalogue, and the solution is rotated and shifted to the
+reference chip.  The linear terms of all exposures, with their covariances, form a time series.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Use of the drift of one solution in another, for example for a filter with few exposures.
 
-In ACS ISR 2015-06, section 4.4.4, the time dependence is derived in one filter and applied to all.
-Rates and steps are transformed to the reference gauge, so that the orientations of the catalogues
-and of the first exposures do not matter.
+In Kozhurina-Platais et al. (2015, section 4.4.4), the time dependence is derived in one filter and
+applied to all. Rates and steps are transformed to the reference gauge, so that the orientations of
+the catalogues and of the first exposures do not matter.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Look-up table of one filter: as a Gaussian random field, or as smoothed means of bins.
 
-The stars sample the random field bilinearly.  The other table follows ACS ISR 2015-06, section
+The stars sample the random field bilinearly.  The other table follows ISR 2015-06, section
 4.3.1: residuals are averaged in bins of 64 x 64 pixels with iterative
 sigma clipping.  The grid is then smoothed with a 5 x 5 quadratic kernel: each node gets the value
 of a quadratic surface fitted with equal weights to the 25 values around it (Anderson and King 2000,
@@ -241,7 +241,7 @@ def _residual(
     return out
 
 
-# -- look-up table after ACS ISR 2015-06: bins, iterative sigma clipping, smoothing ----------------
+# -- look-up table: bins, iterative sigma clipping, smoothing --------------------------------------
 
 
 def binned_table(

@@ -5,8 +5,8 @@ from the residuals with the shifts of the previous tables added back.  Nothing i
 and the iterations converge to the joint solution of polynomial and tables.
 
 The detector's tables are made from the filter with the smallest irregularities and are then fixed.
-Every other filter gets a polynomial and a table of the remaining residuals (ACS ISR 2015-06,
-section 4.3).
+Every other filter gets a polynomial and a table of the remaining residuals (Kozhurina-Platais et
+al. 2015, section 4.3).
 """
 
 from __future__ import annotations
@@ -76,8 +76,8 @@ def fit_with_tables(
         `LookupTable` an upper bound of its error is used.
     method : str
         'field' for a Gaussian random field, which provides the covariance of its nodes; 'binned'
-        for smoothed means in bins as in ACS ISR 2015-06. Both are made orthogonal to the
-        polynomial.
+        for smoothed means in bins as in Kozhurina-Platais et al. (2015). Both are made orthogonal
+        to the polynomial.
     max_iterations : int
         Maximum number of iterations.
     tolerance : float

@@ -65,7 +65,7 @@ def pixel_shifts(solution: Solution, matches: Matches) -> PixelShifts:
     -------
     PixelShifts
         Accurate to first order in the residual. The second-order term is below 1e-5 pixels for
-        residuals of 0.2 pixels and the curvature of ACS/WFC.
+        residuals of 0.2 pixels and the curvature of a wide-field camera.
 
     Raises
     ------

@@ -136,7 +136,7 @@ def self_calibrate(
     parallax_factors : ndarray, shape (E, 2), optional
         Parallax factors of the exposures along u and v; required for 'parallax'.
     dilation : ndarray, shape (E,), optional
-        Known scale of the sky in each exposure (VAFACTOR).
+        Known scale of the sky in each exposure, such as velocity aberration.
     jitter : float, optional
         Additional error of the detections in pixels; fitted by default.
     references : callable, optional

@@ -72,7 +72,7 @@ class Problem:
     match_radius: float  # largest distance in pixels of a detection from its star
     pixel: float  # median size of a pixel on the sky at the start, in the unit of u, v
     epoch0: float = 0.0  # date of the stars' positions in decimal years
-    # known scale (E,) of the sky in each exposure about the origin of the frames (VAFACTOR)
+    # known scale (E,) of the sky in each exposure about the origin of the frames
     dilation: Float | None = None
 
     def __len__(self) -> int:
@@ -305,7 +305,7 @@ def prepare(
     parallax_factors : ndarray, shape (E, 2), optional
         Parallax factors along u and v; required for 'parallax'.
     dilation : ndarray, shape (E,), optional
-        VAFACTOR of each exposure.
+        Factor of velocity aberration of each exposure.
     min_detections : int
         Minimum number of detections of a star.
 

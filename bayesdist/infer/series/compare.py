@@ -6,9 +6,9 @@ with its standard error.  For differences below 4, the standard errors are too s
 Otherwise the neighbours of an exposure would predict it, and an irregular drift would look like a
 line.
 
-To test whether the drift depends on the filter (ACS ISR 2015-06, section 4.4.4), common slopes with
-an offset per filter are compared with a slope per filter.  The slope of each other filter differs
-from that of the first one by the same amount in all segments.
+To test whether the drift depends on the filter (Kozhurina-Platais et al. 2015, section 4.4.4),
+common slopes with an offset per filter are compared with a slope per filter.  The slope of each
+other filter differs from that of the first one by the same amount in all segments.
 """
 
 from __future__ import annotations

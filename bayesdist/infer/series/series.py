@@ -1,8 +1,8 @@
 """Time series of coefficients from fits of single exposures, and trends that may describe them.
 
 For given break dates a trend is linear in its parameters, with the same design matrix for all
-coefficients of a series.  R is the reference date of a segment, like RDATE in Equation 3 of ACS ISR
-2015-06.
+coefficients of a series.  R is the reference date of a segment, as in Equation 3 of
+Kozhurina-Platais et al. (2015).
 
     constant     a
     line         a + b (t - R)

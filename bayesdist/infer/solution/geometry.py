@@ -27,7 +27,7 @@ from bayesdist.utils.numbers import number
 MAS = {"deg": 3.6e6, "arcsec": 1000.0, "mas": 1.0}  # milliarcseconds per unit of u, v
 GRID = 21  # positions per axis at which the distortion is evaluated
 LARGEST_ANISOTROPY = 0.05  # ratio of the scales of the axes minus 1, for square pixels on the sky
-LARGEST_SKEW = 0.1  # rad; ACS, with the most tilted focal plane in use, has 0.09
+LARGEST_SKEW = 0.1  # rad; the most tilted focal plane in use has 0.09
 LARGEST_DISTORTION = 0.05  # fraction of half the diagonal of the chip
 LARGEST_SCALE_ERROR = 0.02  # relative deviation from the stated pixel scale
 RADIANS = 0.01  # relative tolerance on the stretch caused by radians that are read as degrees

@@ -1,6 +1,6 @@
 """Weighted linear fit: two passes with rejection, relinearised frames, formal covariance.
 
-The procedure follows the WISE programme gnDSTR (WSDC D-T033, section 3): fit, reject matches with
+The procedure follows the programme gnDSTR (WSDC D-T033, section 3): fit, reject matches with
 a residual or a chi-square above a limit, and fit again.  Stars near the corners can get additional
 weight.
 """

@@ -24,7 +24,7 @@ from bayesdist.model.alignment import turned, turned_model
 from bayesdist.model.effective import Groups
 from bayesdist.utils.arrays import Complex, Float
 
-# constant, x and y terms of both axes, numbered as in ACS ISR 2015-06 (Equations 1-2)
+# constant, x and y terms of both axes, as in Kozhurina-Platais et al. (2015, Equations 1-2)
 LINEAR_TERMS = ("A_1", "A_2", "A_3", "B_1", "B_2", "B_3")
 MAX_NAMES = 12  # number of exposures listed in an error message
 
@@ -36,10 +36,10 @@ class LinearTerms:
     Parameters
     ----------
     labels : tuple of str
-        Names in the notation of ACS ISR 2015-06: 'A_1' is the constant term of u, 'A_2' its
-        coefficient of x, 'A_3' that of y; 'B_1', 'B_2' and 'B_3' belong to v. If there are several
-        chips, the chip's name is prepended ('WFC1.A_2'). The suffix '.alpha' denotes the value at
-        the reference date, '.beta' the rate.
+        Names in the notation of Kozhurina-Platais et al. (2015): 'A_1' is the constant term of u,
+        'A_2' its coefficient of x, 'A_3' that of y; 'B_1', 'B_2' and 'B_3' belong to v. If there
+        are several chips, the chip's name is prepended ('WFC1.A_2'). The suffix '.alpha' denotes
+        the value at the reference date, '.beta' the rate.
     values : ndarray, shape (k,)
         Coefficients: in the unit of u, v for constants, per pixel for linear terms, and per year
         for rates.
@@ -199,7 +199,7 @@ class _EffectivePolynomials:
 
 
 def segment(solution: Solution, s: int) -> TransformedSolution:
-    """Convert one segment of the time dependence to a model without breaks, as in an IDCTAB.
+    """Convert one segment of the time dependence to a model without breaks.
 
     Parameters
     ----------
@@ -247,9 +247,10 @@ def reference_gauge(
 ) -> GaugedSolution:
     """Rotate and shift (u, v) so that one chip has A_1 = B_1 = 0 and A_3 = 0.
 
-    This is the gauge of ACS ISR 2015-06, section 4.2: the reference pixel of the chip maps to the
-    origin, and there its columns are parallel to v.  All other chips are rotated and shifted with
-    it, so that their coefficients contain the gap and the rotation between the chips.
+    This is the gauge of Kozhurina-Platais et al. (2015), section 4.2: the reference pixel of the
+    chip maps to the origin, and there its columns are parallel to v.  All other chips are rotated
+    and shifted with it, so that their coefficients contain the gap and the rotation between the
+    chips.
 
     Parameters
     ----------
@@ -361,8 +362,8 @@ def lines(solution: Solution, s: int = 0, *, chip: int | None = None) -> LinearT
     -------
     LinearTerms
         Value at the reference date ('A_2.alpha') and rate per year ('A_2.beta') of each
-        coefficient, as in Tables 1-3 of ACS ISR 2015-06. Coefficients that do not drift have a
-        rate of zero.
+        coefficient, as in Tables 1-3 of Kozhurina-Platais et al. (2015). Coefficients that do not
+        drift have a rate of zero.
 
     Raises
     ------

@@ -4,6 +4,7 @@ from bayesdist.plugin import Mission, Plugin
 
 __all__ = ["PLUGIN"]
 
+_LISTS = "bayesdist.formats.hst1pass"
 _COMMANDS = "bayesdist.missions.hst.commands"
 
 PLUGIN = Plugin(
@@ -12,6 +13,8 @@ PLUGIN = Plugin(
             title="HST: handbook figures and pixel area maps.",
             commands={"handbook": f"{_COMMANDS}:handbook", "pam": f"{_COMMANDS}:pam"},
             simulate={"acs": f"{_COMMANDS}:simulate"},
+            match_formats={"matchup": f"{_LISTS}:MATCHUP", "hst1pass": f"{_LISTS}:HST1PASS"},
+            releases={"hst": "bayesdist.missions.hst.release:RELEASE"},
             report="bayesdist.missions.hst.published",
         )
     }

@@ -299,3 +299,13 @@ def _from_galactic(lon: float, lat: float) -> tuple[Float, tuple[float, float]]:
     ra, dec = np.degrees(np.arctan2(y, x)) % 360.0, np.degrees(np.arctan2(z, np.hypot(x, y)))
     turn = plane_axes((ra, dec))[:2] @ matrix @ np.stack([east, north], axis=1)
     return turn, (float(ra), float(dec))
+
+
+def sky_of_header(header: fits.Header, x: Float, y: Float) -> tuple[Float, Float]:
+    """RA and Dec (N,) in degrees of FITS 1-based pixels, computed by astropy.wcs."""
+    from astropy.wcs import WCS, FITSFixedWarning
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FITSFixedWarning)
+        ra, dec = WCS(header).all_pix2world(x, y, 1)
+    return np.asarray(ra), np.asarray(dec)

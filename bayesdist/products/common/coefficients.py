@@ -1,18 +1,16 @@
 """Polynomials in two variables by their coefficients {(i, j): c} of x^i y^j, and their names.
 
-This is the only module that knows which coefficient of a format multiplies which powers of x and y:
+Coefficients of this package and of FITS headers with SIP (Shupe et al. 2005, ASP Conf. 347, 491)
+multiply these powers of the pixel offsets x, y from the reference pixel:
 
-=========  =======================  ========================================
+=========  =======================  ==========
 format     coefficient              multiplies
-=========  =======================  ========================================
+=========  =======================  ==========
 bayesdist  term (i, j)              x^i y^j
 SIP        A_p_q, B_p_q, AP_, BP_   x^p y^q
-IDCTAB     CXnj, CYnj               x^j y^(n-j): CX11 multiplies x, CX10 y
-SIAF       Sci2IdlXnj, Sci2IdlYnj   x^(n-j) y^j: the mirror image of IDCTAB
-=========  =======================  ========================================
+=========  =======================  ==========
 
-x and y are pixel offsets from the reference pixel. The IDCTAB convention is that of stwcs, the SIP
-convention that of Shupe et al. 2005 (ASP Conf. 347, 491).
+Names of other formats are in their own modules.
 """
 
 from __future__ import annotations
@@ -33,26 +31,11 @@ Coefficients = Mapping[tuple[int, int], float]
 
 SINGULAR = 1e-12  # determinant over the largest coefficient squared
 
-_IDCTAB = re.compile(r"(CX|CY|A|B)(\d)(\d)")
 _SIP = re.compile(r"(A|B|AP|BP|AE|BE)_(\d)_(\d)")
 # Search for an extremum: points per axis of the starting grid, and number of points to refine.
 _GRID, _BEST = 65, 8
 _HALVINGS = 30  # of the grid step; the remaining error is below rounding at a smooth maximum
 _BORDER = 2**16  # most steps along an edge, because a stated size may be a misprint
-
-
-def idctab_column(prefix: str, i: int, j: int) -> str:
-    """Column of an IDCTAB that multiplies x^i y^j: ``idctab_column("CX", 1, 0) == "CX11"``."""
-    return f"{prefix}{i + j}{i}"
-
-
-def idctab_powers(column: str) -> tuple[str, int, int] | None:
-    """Prefix and powers (i, j) of x and y of an IDCTAB column; None for any other column."""
-    match = _IDCTAB.fullmatch(column)
-    if match is None or match[3] > match[2]:
-        return None
-    order, i = int(match[2]), int(match[3])
-    return match[1], i, order - i
 
 
 def sip_keyword(prefix: str, i: int, j: int) -> str:

@@ -7,9 +7,9 @@ lossless reading concerns the bytes. A `Calibration` is made from a document.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from astropy.io import fits
 from pydantic import BaseModel, ConfigDict
@@ -21,6 +21,9 @@ from bayesdist.model import LookupTable
 from bayesdist.model.basis import MAX_ORDER
 from bayesdist.products.common.content import Content, readable
 from bayesdist.products.common.read_back import ReadBack
+
+if TYPE_CHECKING:
+    from astropy.wcs import WCS
 
 LEVELS = ("error", "warning", "note")
 PARAMETERS = "parameters"  # kind of a companion file that holds the parameters and their covariance
@@ -46,6 +49,19 @@ class Finding:
 
     def __str__(self) -> str:
         return f"{self.level}: {self.where}: {self.message}"
+
+
+@dataclass(frozen=True)
+class DistortionText:
+    """Description of the distortion in a header."""
+
+    lines: Sequence[str]  # at the beginning, with the size of the image
+    terms: Sequence[str]  # coefficients, at the end
+    findings: Sequence[Finding]
+
+
+# ``(header, name)`` returns the description of a distortion; None if the header has none
+DistortionReader = Callable[[fits.Header, str], DistortionText | None]
 
 
 def of_part(part: str, findings: Iterable[Finding]) -> list[Finding]:
@@ -117,8 +133,7 @@ class Choice:
     Parameters
     ----------
     filter : str, optional
-        Filter of an IDCTAB (names in two wheels may be joined by a comma), or a WISE band such as
-        "W2".
+        Filter or band, for files that hold several.
     size : tuple of float, optional
         Columns and rows, for a header that does not state them.
     as_used : bool
@@ -182,7 +197,7 @@ class Format:
     key : str
         Name in the configuration and on the command line.
     title : str
-        Name with its article, as in "an IDCTAB".
+        Name with its article, as in "a SIP header".
     rank : int
         Position in the order in which formats are tried; the most specific formats come first.
     parse : callable
@@ -212,6 +227,15 @@ class Format:
         a pixel scale.
     asks : tuple of str
         Fields of `Choice` that `calibration` uses: "filter", "size".
+    filters : callable, optional
+        ``filters(parsed)`` returns the names of the filters in a file with several calibrations.
+    mirrored : callable, optional
+        ``mirrored(parsed)`` is True if the axes of u and v are mirrored on the sky.
+    tables : callable, optional
+        ``tables(parsed)`` returns the look-up tables of a detector, each a `LookupTable`.
+    fits_wcs : callable, optional
+        ``fits_wcs(calibration, point)`` returns an `astropy.wcs.WCS` of a one-chip calibration;
+        `point` is the sky position of u, v = 0 in degrees.
     refuse : callable, optional
         For a format without calibrations: ``refuse(parsed, name)`` raises an InputError that
         explains why this file has none, or returns if there is nothing specific to say.
@@ -235,6 +259,10 @@ class Format:
     needs_scale: Callable[[Any], bool] = lambda settings: False
     asks: tuple[str, ...] = ()
     refuse: Callable[[Any, str], None] | None = None
+    filters: Callable[[Any], Collection[str]] | None = None
+    mirrored: Callable[[Any], bool] | None = None
+    tables: Callable[[Any], tuple[LookupTable, ...]] | None = None
+    fits_wcs: Callable[[Calibration, tuple[float, float]], WCS] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -265,6 +293,27 @@ class Document:
         with readable(self.name):
             return "\n".join(self.format.describe(self.holds))
 
+    def filters(self) -> Collection[str]:
+        """Names of the filters in the file; empty if its format has none."""
+        with readable(self.name):
+            return () if self.format.filters is None else self.format.filters(self.holds)
+
+    def mirrored(self) -> bool | None:
+        """True if the axes of u and v are mirrored on the sky; None if that is unknown."""
+        with readable(self.name):
+            return None if self.format.mirrored is None else self.format.mirrored(self.holds)
+
+    def tables(self) -> tuple[LookupTable, ...]:
+        """Look-up tables of the detector; InputError if the format has none."""
+        if self.format.tables is None:
+            raise InputError(
+                f"is {self.format.title}, which holds no look-up tables of a detector",
+                where=self.name,
+                do="give a file with look-up tables, or a run",
+            )
+        with readable(self.name):
+            return self.format.tables(self.holds)
+
     def calibration(self, choice: Choice = Choice()) -> Calibration:
         """Calibration that the file holds.
 
@@ -289,7 +338,7 @@ class Document:
             raise InputError(
                 f"is {self.format.title}, which holds no calibration by itself",
                 where=self.name,
-                do="give a file that holds one, such as an IDCTAB, a header or a run directory",
+                do="give a file that holds one, such as a header or a run directory",
             )
         with readable(self.name):
             calibration = self.format.calibration(self.holds, self.name, choice)

@@ -203,7 +203,7 @@ def test_published_errors_of_tables_hold_what_lies_between_nodes(run):
 
 def test_check_says_what_there_is(folder):
     text = good("check", folder / "campaign_f606w.toml").out
-    assert "16 in F606W" in text and "VAFACTOR" in text and "WARNING" not in text
+    assert "16 in F606W" in text and "aberration" in text and "WARNING" not in text
 
 
 # -- wrong input ----------------------------------------------------------------------------------

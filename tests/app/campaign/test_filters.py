@@ -14,7 +14,7 @@ from astropy.table import Table
 
 import bayesdist.app.commands.on_runs.release
 import bayesdist.app.results
-import bayesdist.products.release
+import bayesdist.missions.hst.release
 from bayesdist.app.commands.on_runs.filters import compare_filters
 from bayesdist.app.commands.on_runs.release import _require_alike
 from bayesdist.app.kinds.campaign.reference import held_tables
@@ -405,7 +405,7 @@ def test_nothing_is_left_of_a_release_that_fails_late(runs, tmp_path, monkeypatc
 
     # it takes a while
     monkeypatch.setattr(bayesdist.app.commands.on_runs.release, "compare_filters", has_none)
-    monkeypatch.setattr(bayesdist.products.release, "write_npol", fails)
+    monkeypatch.setattr(bayesdist.missions.hst.release, "write_npol", fails)
     refused(tmp_path, *runs.values(), words=["the disk is full"])
 
 

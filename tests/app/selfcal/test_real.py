@@ -8,7 +8,7 @@ from scipy import stats
 
 from bayesdist.app.results import results_of
 from bayesdist.app.store.rundir import RunDirectory
-from bayesdist.data import read_hst1pass
+from bayesdist.formats.hst1pass import read_hst1pass
 from bayesdist.infer.selfcal import gauge_free
 from tests.app.support import good, summary_of, write_config
 from tests.reduced import only_in_full

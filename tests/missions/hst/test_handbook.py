@@ -200,7 +200,7 @@ def test_a_run_is_shown_with_its_residuals(idctab, tmp_path):
         (("apply", "I", "S", "-o", "o.ecsv", "--chip", "4"), ["no chip 4"]),
         (("apply", "I", "S", "-o", "o.ecsv", "--scale", "0"), ["the scale is 0", "--scale"]),
         (("apply", "I", "S", "-o", "o.ecsv", "--scale", "nan"), ["the scale is nan"]),
-        (("apply", "I", "S", "-o", "o.ecsv", "--vafactor", "-1"), ["VAFACTOR is -1"]),
+        (("apply", "I", "S", "-o", "o.ecsv", "--vafactor", "-1"), ["aberration factor is -1"]),
         (("apply", "I", "S", "-o", "o.ecsv", "--ltv", "1", "1", "--corner", "2", "2"), ["--ltv"]),
         (("apply", "I", "S", "-o", "o.ecsv", "--image", "I"), ["no SCI extension"]),
         (("apply", "I", "B", "-o", "o.ecsv"), ["column 'x_out' already"]),

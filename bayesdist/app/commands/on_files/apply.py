@@ -71,7 +71,7 @@ def apply_to_table(
         Transform back to pixels.
     method : str
         Method of the inverse: 'newton' (on the forward polynomials), 'polynomial' (fitted here), or
-        'table' (INVERSE rows of an IDCTAB).
+        'table' (inverse that the file states).
     order : int, optional
         Order of the fitted polynomial.
     columns : sequence of str, optional
@@ -89,7 +89,7 @@ def apply_to_table(
     origin : tuple of float, optional
         Output pixel of the zero point, (0, 0) by default.
     vafactor : float
-        VAFACTOR of the exposure.
+        Factor of velocity aberration of the exposure.
     image, ltv, corner
         See `images_of`.
     force : bool

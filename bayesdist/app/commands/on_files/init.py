@@ -94,7 +94,7 @@ unit = "{unit}"
 
 [products]
 sip = {{}}                        # inverse_order, linear = "cd" | "sip", crval
-# idctab = {{instrument = "ACS", detector = "WFC"}}
+# parameters = {{}}             # table of all parameters with their covariance
 """
 
 _REJECT = """\

@@ -8,8 +8,13 @@ from pathlib import Path
 from bayesdist.app.commands.on_files.init_guesses import detector_lines, quoted
 from bayesdist.app.config import parse_config
 from bayesdist.data import read_star_lists
-from bayesdist.data.formats.files import TableLayout, input_files, kind_of, table_layout
-from bayesdist.data.formats.hst1pass import read_hst1pass
+from bayesdist.data.formats.files import (
+    TableLayout,
+    input_files,
+    kind_of,
+    mission_formats,
+    table_layout,
+)
 
 MAX_CANDIDATES = 40  # largest number of columns listed
 
@@ -44,7 +49,7 @@ lists = {relative}
 {columns}match_radius = 0.5              # pixels between detections of one star in the end
 # sigma = "measured"            # errors of the pixels, by magnitude; or "columns", or one number
 # start_radius = 2.0            # and at the beginning, before the distortion is known
-# initial_distortion = ""       # a finished run, or an IDCTAB: for a distortion of some ten pixels
+# initial_distortion = ""       # a finished run, or a calibration file: for some ten pixels
 
 # [gauge]                       # fixes scale, orientation and skew
 # offsets = ""                  # a table of commanded offsets: exposure, du, dv, sigma
@@ -59,7 +64,7 @@ order = 3                       # 1 to 12
 # lists = {relative}
 # catalog = ""                  # FILL IN: a table with ra, dec (Gaia's, say) or u, v
 # exposures = ""                # FILL IN: a table with exposure, epoch, filter, vafactor
-# initial_distortion = ""       # FILL IN: an IDCTAB near enough to find the stars by
+# initial_distortion = ""       # FILL IN: a calibration near enough to find the stars by
 
 # 3. Matched by another program, as TOPCAT or astropy's match_to_catalog_sky, the table has ra, dec
 #    of the catalogue beside each detection: 'bayesdist init' makes a configuration of it.
@@ -126,11 +131,10 @@ def draft_of(
 
 
 def _lacking(matches: str | Path, columns: Mapping[str, str] | None) -> list[str]:
-    """Reference positions missing from a list of hst1pass; empty for other formats."""
+    """Reference positions missing from a list in the format of a mission; else empty."""
     file = input_files(matches)[0]
-    if kind_of(file, columns) != "hst1pass":
-        return []
-    return [key for key in ("u", "v") if key not in read_hst1pass(file).columns]
+    format_ = mission_formats().get(kind_of(file, columns))
+    return [] if format_ is None or format_.lacking is None else format_.lacking(file)
 
 
 def _candidates(path: Path, matches: str | Path, layout: TableLayout) -> str:

@@ -180,7 +180,7 @@ def compare_files(
     chip : int, optional
         Chip to compare; by default all common chips, one by one.
     filter : str, optional
-        Filter of IDCTABs, or band of WISE meta-data; two for A and B, joined by a colon.
+        Filter or band of a file with several; two for A and B, joined by a colon.
     epoch : float, optional
         Date in decimal years.
     size : tuple of float, optional

@@ -1,6 +1,6 @@
 """Comparison of other filters with the reference: linear terms, drift, and figures.
 
-See ACS ISR 2015-06, section 4.4.4 and Figures 25 and 26.
+See Kozhurina-Platais et al. (2015), section 4.4.4 and Figures 25 and 26.
 """
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ from bayesdist.app.config import CampaignConfig
 from bayesdist.app.config.products import ReleaseBlock
 from bayesdist.app.kinds.campaign.parts import ExposuresAlone
 from bayesdist.app.kinds.fitted import Fitted
-from bayesdist.app.products.made_files import write_files
+from bayesdist.app.products.release_set import release_set
 from bayesdist.app.results import Results, results_of
 from bayesdist.app.screen import table_text
 from bayesdist.app.store.output import record_folder, write_table
@@ -40,7 +40,7 @@ def release_runs(
     allow_unconverged: bool = False,
     command: str = "",
 ) -> str:
-    """Write IDCTABs, D2IMFILE and NPOLFILEs for several filters to a new folder.
+    """Write the files of a release for several filters to a new folder.
 
     Parameters
     ----------
@@ -84,7 +84,7 @@ def release_runs(
             table.meta["drift"] = {"verdict": why_not}
         with record_folder(Path(output), "release.json", command) as (folder, record):
             tables = _tables(by_filter)
-            files = write_files(block, chip, first.base, folder, solutions, tables, notes)
+            files = release_set().write(block, chip, first.base, folder, solutions, tables, notes)
             write_table(table, folder / "filters.ecsv")
             figures = draw_filters(
                 folder,

@@ -15,8 +15,8 @@ from bayesdist.app.kinds.star_lists import refuse_other_chips
 from bayesdist.data.matching.reports import check_campaign
 from bayesdist.data.preparing import refuse_strangers
 from bayesdist.errors import ConfigError, DegenerateError, InputError
-from bayesdist.formats.idctab.table import read_idctab
 from bayesdist.model import TimeDependence
+from bayesdist.products.registry import open_document
 from bayesdist.utils.arrays import Float, Int
 
 MIN_EXPOSURES = 3  # exposures: two do not determine a scatter
@@ -31,10 +31,10 @@ def refuse_campaign(inputs: Inputs) -> None:
     """Refuse inconsistent inputs, and files of other runs or products that cannot be used."""
     config, base = inputs.config, inputs.base
     refuse_unsound(inputs)
-    read_idctab(base / config.campaign.initial_distortion)
+    open_document(base / config.campaign.initial_distortion)
     rehearse_references(config, inputs.catalog.unit, base)
     if config.products.release is not None:
-        read_idctab(base / config.products.release.reference)
+        open_document(base / config.products.release.reference)
 
 
 def refuse_unsound(inputs: Inputs) -> None:
@@ -97,8 +97,8 @@ def input_warnings(inputs: Inputs) -> list[str]:
             )
     if config.campaign.vafactor_source == "earth":
         out.append(
-            "VAFACTOR was computed from the motion of the Earth: that of the telescope about it, "
-            "up to 2.5e-5, is in the scales of the exposures"
+            "the factors of velocity aberration were computed from the motion of the Earth: that "
+            "of the telescope about it, up to 2.5e-5, is in the scales of the exposures"
         )
     return out
 

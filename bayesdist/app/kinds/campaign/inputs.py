@@ -23,10 +23,9 @@ from bayesdist.data import (
 from bayesdist.data.sky import mean_direction, tangent_plane
 from bayesdist.errors import InputError
 from bayesdist.files.tables import read_table
-from bayesdist.formats.idctab.hst import parity_of
-from bayesdist.formats.idctab.table import IdcTab
 from bayesdist.infer.catalogue.star_errors import StarErrors
 from bayesdist.model import DistortionModel, LookupTable
+from bayesdist.products.common.document import Document
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +37,7 @@ class Inputs:
     whole_catalog: ReferenceCatalog  # all stars in the file
     # without stars that have unreliable proper motions, if these are to be excluded
     catalog: ReferenceCatalog
-    log: ExposureLog  # exposures of the calibrated filter, with VAFACTOR
+    log: ExposureLog  # exposures of the calibrated filter, with factors of aberration
     star_lists: StarLists  # star lists of the exposures in `log`
     # exposures with a list but without an entry in the log, in any filter; not used
     unlogged: tuple[str, ...] = ()
@@ -46,12 +45,12 @@ class Inputs:
 
     @property
     def largest_vafactor(self) -> float:
-        """Largest VAFACTOR, by which catalogue errors are divided; all factors are nearly equal."""
+        """Largest factor of aberration, by which catalogue errors are divided; all nearly equal."""
         return float(self.log.values("vafactor").max())
 
     @property
     def pixel_arcsec(self) -> float:
-        """Pixel size in arcsec; that of ACS/WFC if the configuration gives none."""
+        """Pixel size in arcsec; 0.05 if the configuration gives none."""
         return (self.config.detector.scale_mas or 50.0) / 1000
 
     @property
@@ -112,7 +111,7 @@ def read_campaign(config: CampaignConfig, base: Path) -> Inputs:
 
 
 def _exposures_of(block: CampaignBlock, log: ExposureLog) -> ExposureLog:
-    """Exposures of the filter to be calibrated, with VAFACTOR."""
+    """Exposures of the filter to be calibrated, with their factors of velocity aberration."""
     if block.filter is not None and block.filter not in log.filters:
         raise InputError(
             f"there is no exposure in filter {block.filter!r}",
@@ -200,17 +199,18 @@ def _middle_of(log: ExposureLog, catalog: ReferenceCatalog) -> tuple[float, floa
     return point if inside else None
 
 
-def parities_of(block: CampaignBlock, catalog: ReferenceCatalog, tab: IdcTab) -> tuple[bool, ...]:
+def parities_of(
+    block: CampaignBlock, catalog: ReferenceCatalog, initial: Document
+) -> tuple[bool, ...]:
     """Parities of the catalogue to try, the more probable one first; True is mirrored.
 
-    V2 and V3 have the same parity on the sky as east and north, and the IDCTAB states how its axes
-    are oriented with respect to V2 and V3.
+    `initial` is the file of the initial distortion, whose format may state the parity of its axes.
     """
     if block.parity != "auto":
         return (block.parity == "mirrored",)
     if catalog.tangent_point is None:
         return (False,)
-    expected = bool(np.prod(parity_of(tab.instrument, tab.detector)) < 0)
+    expected = bool(initial.mirrored())
     return (expected, not expected)
 
 

@@ -24,6 +24,7 @@ from bayesdist.infer import Posterior
 from bayesdist.infer.catalogue.star_errors import StarErrors
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.model import DistortionModel, LookupTable
+from bayesdist.products.registry import open_document
 from bayesdist.utils.arrays import Float
 
 GAUGE_EXPOSURES = 1  # leading exposures that define the gauge and cannot be held out
@@ -66,10 +67,11 @@ class CampaignMatched(Matched):
     def overlap(self, posterior: Posterior, tables: tuple[LookupTable, ...]) -> OverlapTest | None:
         """Comparison of two exposures far apart in time; None if there is no such pair."""
         inputs, block = self.inputs, self.inputs.config.campaign
+        initial = open_document(inputs.base / block.initial_distortion)
         return overlap_test(
             self.stars,
             posterior,
-            known_calibration(inputs.base / block.initial_distortion, block.filter),
+            known_calibration(initial, block.filter),
             tables,
             unit_arcsec=inputs.unit_arcsec,
             pixel=inputs.pixel_arcsec,

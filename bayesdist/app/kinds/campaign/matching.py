@@ -23,6 +23,7 @@ from bayesdist.app.kinds.star_lists import (
     positions_by_chip,
     start_of,
 )
+from bayesdist.calibration.calibration import Calibration
 from bayesdist.data import (
     Detections,
     ExposureLog,
@@ -32,9 +33,9 @@ from bayesdist.data import (
 )
 from bayesdist.data.matching.campaign import CampaignMatches
 from bayesdist.errors import InputError
-from bayesdist.formats.idctab.table import read_idctab
 from bayesdist.infer.solution.geometry import geometry_of
 from bayesdist.model import Chip
+from bayesdist.products.registry import open_document
 
 log = logging.getLogger("bayesdist")
 
@@ -42,11 +43,12 @@ log = logging.getLogger("bayesdist")
 def match_lists(inputs: Inputs) -> CampaignMatched:
     """Match star lists with a catalogue, exposure by exposure."""
     config, block, lists = inputs.config, inputs.config.campaign, inputs.star_lists
-    tab = read_idctab(inputs.base / block.initial_distortion)
-    parities = parities_of(block, inputs.catalog, tab)
+    document = open_document(inputs.base / block.initial_distortion)
+    initial = known_calibration(document, block.filter)
+    parities = parities_of(block, inputs.catalog, document)
     for text in (*([inputs.plane] if inputs.plane else []), *inputs.catalog.notes):
         log.info("match: catalogue: %s", text)
-    start = start_of(tab, inputs.unit_arcsec, block.filter)
+    start = start_of(initial, inputs.unit_arcsec)
     matches = match_campaign(
         _gauge_first(lists, config.chips()[0].number),
         inputs.log,
@@ -62,7 +64,7 @@ def match_lists(inputs: Inputs) -> CampaignMatched:
         refuse_few(remaining.values("epoch"), config.time())
     table = _table(matches, inputs.log)
     warnings = [
-        *_doubtful_parity(matches.mirrored, parities, f"{tab.instrument}/{tab.detector}"),
+        *_doubtful_parity(matches.mirrored, parities, _detector_of(initial)),
         *matches.warnings(inputs.log),
         *input_warnings(inputs),
         # roll angles of the matches, because the log need not have them
@@ -80,7 +82,7 @@ def match_lists(inputs: Inputs) -> CampaignMatched:
 
 
 def _table(found: CampaignMatches, exposures: ExposureLog) -> Table:
-    """One row per exposure, with its VAFACTOR and roll angle."""
+    """One row per exposure, with its factor of velocity aberration and roll angle."""
     table = found.summary()
     names = list(exposures.names)
     order = [names.index(name) for name in table["exposure"]]
@@ -131,6 +133,12 @@ def _log(matched: CampaignMatched, n_detected: int) -> None:
         )
     for text in matched.warnings:
         log.warning("match: WARNING: %s", text)
+
+
+def _detector_of(calibration: Calibration) -> str:
+    """Names of instrument and detector, or else the name of the calibration."""
+    parts = filter(None, (calibration.instrument, calibration.detector))
+    return "/".join(parts) or calibration.name
 
 
 def _doubtful_parity(mirrored: bool, parities: tuple[bool, ...], detector: str) -> list[str]:
@@ -184,7 +192,7 @@ def campaign_lines(inputs: Inputs) -> Iterator[str]:
     yield f"epochs       {epochs.min():.2f} to {epochs.max():.2f}"
     factors = log.values("vafactor")
     how = ", of the Earth alone" if config.campaign.vafactor_source == "earth" else ""
-    yield f"VAFACTOR     {factors.min():.7f} to {factors.max():.7f}{how}"
+    yield f"aberration   {factors.min():.7f} to {factors.max():.7f}{how}"
     yield f"PA_V3        {_rolls(rolls)}"
     time = config.time()
     if time is not None:
@@ -192,9 +200,8 @@ def campaign_lines(inputs: Inputs) -> Iterator[str]:
         yield f"segments     {', '.join(str(k) for k in counts)} exposures"
     chips = ", ".join(chip.name for chip in config.chips())
     yield f"model        order {config.model.order}, chips {chips}, tables: {config.tables.method}"
-    initial = known_calibration(
-        inputs.base / config.campaign.initial_distortion, config.campaign.filter
-    )
+    document = open_document(inputs.base / config.campaign.initial_distortion)
+    initial = known_calibration(document, config.campaign.filter)
     for number in sorted({chip.number for chip in config.chips()} & set(initial.numbers)):
         sentence = geometry_of(initial.solution, number).sentence
         yield f"geometry     chip {number} of campaign.initial_distortion: {sentence}"

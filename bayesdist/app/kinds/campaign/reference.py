@@ -11,10 +11,10 @@ from bayesdist.app.kinds.campaign.linear_terms import with_gap
 from bayesdist.app.kinds.fitted import converged_posterior
 from bayesdist.app.kinds.parts import read_tables
 from bayesdist.errors import InputError
-from bayesdist.formats.lookup.d2im import read_d2im
 from bayesdist.infer import GaussianPriors
 from bayesdist.infer.exposures.shared_drift import drift_priors
 from bayesdist.model import Chip, DistortionModel, LookupTable
+from bayesdist.products.registry import open_document
 
 
 def held_tables(block: TablesBlock, chips: tuple[Chip, ...], base: Path) -> tuple[LookupTable, ...]:
@@ -29,14 +29,14 @@ def held_tables(block: TablesBlock, chips: tuple[Chip, ...], base: Path) -> tupl
         stored = read_tables(path, do="run its stage 'fit' again").tables
         tables = tuple(table for table in stored if not table.filter)
     else:
-        tables = read_d2im(path)
+        tables = open_document(path).tables()
     have = {table.chip for table in tables}
     missing = [chip.name for chip in chips if chip.number not in have]
     if missing:
         raise InputError(
             f"there is no table of the detector for chip {missing[0]}",
             where=str(path),
-            do="name the run or the D2IMFILE of this detector in tables.detector",
+            do="name the run or the file of tables of this detector in tables.detector",
         )
     numbers = {chip.number for chip in chips}
     ours = (table for table in tables if table.chip in numbers)

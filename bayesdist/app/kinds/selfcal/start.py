@@ -9,7 +9,7 @@ import numpy as np
 from bayesdist.app.config import SelfcalConfig
 from bayesdist.app.config.section import one_chip
 from bayesdist.app.kinds.selfcal.known import Commanded
-from bayesdist.app.kinds.star_lists import positions_by_chip, start_of
+from bayesdist.app.kinds.star_lists import known_calibration, positions_by_chip, start_of
 from bayesdist.data import ReferenceCatalog
 from bayesdist.data.detections import Detections
 from bayesdist.data.matching.field import mutual_frames
@@ -25,6 +25,7 @@ from bayesdist.infer.selfcal.prior import (
     undistorted,
 )
 from bayesdist.model import Chip, DistortionModel
+from bayesdist.products.registry import open_document
 from bayesdist.utils.arrays import Float, Int
 
 
@@ -111,7 +112,7 @@ def _lists(d: Detections, *, apart: bool) -> tuple[Int, Int, list]:
 def _first(
     config: SelfcalConfig, base: Path, chips: tuple[Chip, ...], unit_arcsec: float | None
 ) -> Start:
-    """Initial distortion: of an earlier run, of an IDCTAB, or none."""
+    """Initial distortion: of an earlier run, of a calibration file, or none."""
     block, scale = config.selfcal, config.detector.scale_mas
     pixel = 1.0
     if block.unit != "pix" and scale is not None and unit_arcsec is not None:
@@ -135,11 +136,11 @@ def _first(
         return earlier
     if unit_arcsec is None:
         raise InputError(
-            "an IDCTAB is in seconds of arc, and nobody says what a pixel is",
+            "a calibration file is in arcsec, and the pixel scale is unknown",
             where=str(path),
-            do="give detector.scale_mas",
+            do="set detector.scale_mas",
         )
-    return start_of(path, unit_arcsec)
+    return start_of(known_calibration(open_document(path), None), unit_arcsec)
 
 
 def _onto_references(

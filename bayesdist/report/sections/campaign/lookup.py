@@ -67,7 +67,7 @@ def lookup_table(r: ReportInput) -> TextTable:
 def table_residuals(r: ReportInput) -> Plot:
     """Residuals of single stars on each chip, without the tables and with them.
 
-    Figures 6 and 7 of ACS ISR 2015-06.
+    Figures 6 and 7 of Kozhurina-Platais et al. (2015).
     """
     results = needed(r.campaign)
     order = sorted(range(len(results.residuals)), key=lambda k: r.mosaic.places[k])
@@ -147,7 +147,7 @@ def _base(c: CampaignResults) -> str:
 def residual_map(r: ReportInput, which: str) -> Plot:
     """Mean residual of each cell, without the tables or with them, at one scale for both.
 
-    Figure 10 of ACS ISR 2015-06.
+    Figure 10 of Kozhurina-Platais et al. (2015).
     """
     c = needed(r.campaign)
     binned = binned_of(c.residuals, which)

@@ -55,7 +55,7 @@ def matching_table(r: ReportInput) -> TextTable:
 def catalogue_errors(r: ReportInput) -> Plot:
     """Errors of positions, and of proper motions with the limit of their selection.
 
-    Figure 3 of ACS ISR 2015-06.
+    Figure 3 of Kozhurina-Platais et al. (2015).
     """
     c = needed(r.campaign)
     catalog, centroids, section = needed(c.catalog), c.centroids, c.section("matching")
@@ -140,7 +140,7 @@ def _motions(ax: Axes, catalog: CatalogStars, error: Float) -> None:
 
 @REPORT.figure("campaign-matching", needs=("campaign.detections",))
 def fit_quality(r: ReportInput) -> Plot:
-    """Quality of the PSF fit against magnitude, with the cuts: Figure 5 of ACS ISR 2015-06."""
+    """Quality of the PSF fit against magnitude, with the cuts."""
     d = needed(needed(r.campaign).detections)
     faintest, brightest = np.quantile(d.mag, (0.9995, 0.001))
     low, high = np.quantile(d.q[d.q > 0], (0.0005, 0.9995))
@@ -220,7 +220,7 @@ def matching(r: ReportInput) -> Plot:
 
 @REPORT.figure("campaign-matching", needs=("campaign.footprints",))
 def footprints(r: ReportInput) -> Plot:
-    """Outlines of the chips of every exposure over the catalogue: Figure 4 of ACS ISR 2015-06."""
+    """Outlines of the chips of every exposure over the catalogue."""
     c = needed(r.campaign)
     field = needed(c.footprints)
     fig = new_figure(0.85 * WIDTH, 0.78 * WIDTH, layout="compressed")

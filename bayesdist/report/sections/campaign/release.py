@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from bayesdist.diagnose.overlap import OverlapTest
+from bayesdist.plugin import mission_objects
 from bayesdist.report.contents import REPORT, Plot
 from bayesdist.report.context import ReportInput, needed
 from bayesdist.report.figures.arrows import Arrows, magnification_of, vector_map
@@ -17,18 +18,14 @@ from bayesdist.utils.numbers import count, number, size_of
 
 MIN_STARS_PER_CELL = 5  # of a cell that is drawn and counted
 
-_KINDS = {
-    "IDCTAB": "IDCTAB: polynomial and its drift",
-    "D2IMFILE": "D2IMFILE: tables of the detector",
-    "NPOLFILE": "NPOLFILE: tables of the filter",
-}
-
 
 @REPORT.table("campaign-release", needs=("campaign",))
 def released_files(r: ReportInput) -> TextTable | None:
     """Table of files for pipelines with their dates; None if no files were written."""
     c = needed(r.campaign)
-    files = [p for p in c.summary.get("products") or () if p["kind"] in _KINDS]
+    releases = mission_objects(lambda mission: mission.releases).values()
+    kinds = {kind: text for release in releases for kind, text in release.kinds.items()}
+    files = [p for p in c.summary.get("products") or () if p["kind"] in kinds]
     if not files:
         return None
     release = c.config.get("products", {}).get("release") or {}
@@ -41,7 +38,7 @@ def released_files(r: ReportInput) -> TextTable | None:
         rows.append(
             {
                 "File": p["path"],
-                "What it is": _KINDS[p["kind"]],
+                "What it is": kinds[p["kind"]],
                 "Dates": dates,
                 "Drift that it cannot hold, at most [mas]": number(lost, 2),
             }
@@ -53,7 +50,7 @@ def released_files(r: ReportInput) -> TextTable | None:
 def overlap(r: ReportInput) -> Plot:
     """Residuals between two exposures after shift, rotation and scale: old files and new.
 
-    Figures 27 and 28 of ACS ISR 2015-06.
+    Figures 27 and 28 of Kozhurina-Platais et al. (2015).
     """
     t = needed(needed(r.campaign).overlap)
     states = {"old": (t.binned_old, t.old), "new": (t.binned_new, t.new)}

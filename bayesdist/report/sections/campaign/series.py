@@ -38,7 +38,7 @@ _SCATTER = {
 
 
 def name_of_term(term: str) -> str:
-    """Name of a linear term with its meaning, as in Section 4.2 of ACS ISR 2015-06."""
+    """Name of a linear term with its meaning, as in Kozhurina-Platais et al. (2015)."""
     return _TERMS.get(term, term)
 
 
@@ -56,7 +56,7 @@ class TermCourse:
     label: str  # with the name of the chip, 'WFC1.A_2'
     value: Float  # (E,), corrected for velocity aberration
     sigma: Float  # (E,), formal
-    raw: Float  # (E,), as measured, that is multiplied by VAFACTOR
+    raw: Float  # (E,), as measured, that is multiplied by the factor of aberration
     line: Float  # (E,), line of the exposure's segment at its date
     drift: Float  # (E,), rate times time since the reference date
     alpha: Float  # (S,)
@@ -82,12 +82,12 @@ class TermCourse:
 
     @property
     def rms_raw(self) -> float:
-        """Scatter about the lines before correction for VAFACTOR, without its mean."""
+        """Scatter about the lines before correction for aberration, without its mean."""
         return float(np.std((self.raw - self.line)[self.good]))
 
     @property
     def rms(self) -> float:
-        """Scatter about the lines after correction for VAFACTOR."""
+        """Scatter about the lines after correction for aberration."""
         return float(np.std((self.value - self.line)[self.good]))
 
 
@@ -146,7 +146,7 @@ def line_error(series: LinearSeries, column: str, s: int, t: Float) -> Float | N
 
 
 ABREAST = 2  # number of chips in a figure
-FALLS = 1.2  # ratio of the scatter before and after VAFACTOR, above which aberration is visible
+FALLS = 1.2  # ratio of the scatter before and after correction, above which aberration is visible
 
 
 def _figures(r: ReportInput) -> Mapping[str, tuple[str, int]]:
@@ -161,9 +161,10 @@ def _figures(r: ReportInput) -> Mapping[str, tuple[str, int]]:
 
 @REPORT.figure("campaign-time", needs=("campaign.series",), each=_figures)
 def series(r: ReportInput, which: tuple[str, int]) -> Plot:
-    """A term of some chips: as measured, after VAFACTOR with its lines, and without drift.
+    """A term of some chips: as measured, without aberration with its lines, and without drift.
 
-    Against time, and against PA_V3 where it is known: Figures 14 to 24 of ACS ISR 2015-06.
+    Against time, and against PA_V3 where it is known: Figures 14 to 24 of Kozhurina-Platais et al.
+    (2015).
     """
     campaign, (term, n) = needed(r.campaign), which
     series, unit = needed(campaign.series), campaign.unit
@@ -199,7 +200,8 @@ def series(r: ReportInput, which: tuple[str, int]) -> Plot:
     falls = all(course.rms_raw > FALLS * course.rms for course in courses)
     text = _how_to_read(campaign, with_roll) if first else "As the figure before."
     text += (
-        f" With VAFACTOR the scatter about the lines {'falls' if falls else 'hardly changes'}:"
+        " Without velocity aberration the scatter about the lines"
+        f" {'falls' if falls else 'hardly changes'}:"
         f" {rms}. Beyond the formal errors the exposures scatter by {exposure_scatter}."
     )
     if all(c.label in verdicts for c in courses):
@@ -225,10 +227,9 @@ def _how_to_read(c: CampaignResults, with_roll: bool) -> str:
         gauge = f", shifted and turned so that {fixed} of {c.chip_name(g['chip'])} are zero in it"
     return (
         f"Each exposure fitted by itself{gauge}, with formal errors{places}. Top: as measured."
-        " Middle:"
-        " VAFACTOR applied, with the line of each segment, its 68 % band and the wider one of a"
-        " new exposure. Bottom: rate times time since the reference date taken out; steps between"
-        " segments stay."
+        " Middle: velocity aberration taken out, with the line of each segment, its 68 % band and"
+        " the wider one of a new exposure. Bottom: rate times time since the reference date"
+        " taken out; steps between segments stay."
     )
 
 
@@ -241,7 +242,7 @@ def _draw_course(panels: Any, series: LinearSeries, course: TermCourse, unit: st
     who = f"{course.chip}, " if course.chip else ""
     states = (
         (course.raw, f"{who}as measured: rms {course.rms_raw * factor:.3g}"),
-        (course.value, f"{who}VAFACTOR applied: rms {course.rms * factor:.3g}"),
+        (course.value, f"{who}aberration taken out: rms {course.rms * factor:.3g}"),
         (course.value - course.drift, f"{who}drift taken out"),
     )
     for row, (values, title) in zip(panels, states, strict=True):
@@ -309,7 +310,7 @@ def _segment_name(breaks: tuple[float, ...], s: int) -> str:
 
 
 def _share_limits(*rows: Sequence[Axes]) -> None:
-    """Use the same range in the panels before and after VAFACTOR, to compare their scatter."""
+    """Use one range in the panels before and after the correction, to compare their scatter."""
     limits = [row[0].get_ylim() for row in rows]
     low, high = min(a for a, _ in limits), max(b for _, b in limits)
     for row in rows:

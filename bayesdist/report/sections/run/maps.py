@@ -112,7 +112,7 @@ def uncertainty_radius(r: ReportInput) -> Plot:
 def distortion(r: ReportInput) -> Plot:
     """Vectors from each array position to where the distortion puts it.
 
-    As section 4 of the WISE distortion report, with the zeroth order suppressed.
+    As section 4 of WSDC D-T033, with the zeroth order suppressed.
     """
     v, position = _longest(r, "displacement")
     notes = {c.chip.name: c.displacement.part_note for c in r.chips}
@@ -138,7 +138,7 @@ def distortion(r: ReportInput) -> Plot:
 def pixel_area(r: ReportInput) -> Plot:
     """Contours of the pixel area relative to that at the reference pixel, in percent.
 
-    As Figure 4.5 of the ACS handbook, which gives the same ratio without subtracting one.
+    Handbooks of cameras give the same ratio without subtracting one.
     """
     areas = [c.area for c in r.chips]
     grids = [Grid(a.x, a.y, 100.0 * (a.area - 1.0)) for a in areas]
@@ -217,7 +217,7 @@ def pixel_scale(r: ReportInput) -> Plot:
 
 @REPORT.figure("maps")
 def distortion_non_linear(r: ReportInput) -> Plot:
-    """Vectors of the non-linear part, as Figure 4.1 of the ACS handbook."""
+    """Vectors of the non-linear part."""
     v, position = _longest(r, "non_linear")
     return Plot(
         _flow(r, [c.non_linear for c in r.chips]),
@@ -336,7 +336,7 @@ def _longest(r: ReportInput, which: str) -> tuple[VectorMap, str]:
 def formal_uncertainty(r: ReportInput) -> Plot:
     """Four vectors from each position, to (±sigma_u, ±sigma_v).
 
-    As section 6 of the WISE distortion report, which draws them 2000 times larger than the
+    As section 6 of WSDC D-T033, which draws them 2000 times larger than the
     detector.
     """
     maps = [m for c in r.chips for m in c.maps]

@@ -17,8 +17,10 @@ import numpy as np
 
 from bayesdist.data.catalog import ReferenceCatalog
 from bayesdist.data.detections import Detections
+from bayesdist.data.formats.files import MatchFormat
 from bayesdist.data.matches import Matches
 from bayesdist.errors import FormatError
+from bayesdist.files.tables import is_binary
 from bayesdist.files.unpacked import read_lines
 from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.text import number_of
@@ -170,11 +172,21 @@ class Hst1passList:
         )
 
 
-def is_hst1pass(path: Path, lines: list[str]) -> bool:
+def is_hst1pass(path: Path) -> bool:
     """True for an hst1pass list, recognised by its lines or its suffix."""
-    return any(line.startswith("#") and "FILEOUT:" in line for line in lines) or bool(
-        _suffix_letters(path)
+    return bool(_suffix_letters(path)) or any(
+        line.startswith("#") and "FILEOUT:" in line for line in _text_lines(path)
     )
+
+
+def is_matchup(path: Path) -> bool:
+    """True if a file begins like a MATCHUP master or a calibrated form of it."""
+    return _names_matchup(_text_lines(path))
+
+
+def _text_lines(path: Path) -> list[str]:
+    """Lines of a text file; empty for a binary file."""
+    return [] if is_binary(path) else read_lines(path)
 
 
 def _suffix_letters(path: Path) -> list[str]:
@@ -185,7 +197,7 @@ def _suffix_letters(path: Path) -> list[str]:
     return list(letters) if named else []
 
 
-def is_matchup(lines: list[str]) -> bool:
+def _names_matchup(lines: list[str]) -> bool:
     """True if the lines begin like a MATCHUP master or a calibrated form of it."""
     head = lines[:5]
     return any(line.startswith("#") and "xbar" in line and "ysig" in line for line in head) or (
@@ -329,7 +341,7 @@ def read_matchup(
     """
     path = Path(path)
     lines = read_lines(path)
-    if not is_matchup(lines):
+    if not _names_matchup(lines):
         raise FormatError(
             "is no MATCHUP master: its head names no xbar, ybar, ... and no x, y, m, xe, ye, ...",
             where=str(path),
@@ -341,3 +353,12 @@ def read_matchup(
     return ReferenceCatalog(
         u=x, v=y, sigma_u=xsig, sigma_v=ysig, mag=m, epoch=epoch, unit=unit, source=str(path)
     )
+
+
+HST1PASS = MatchFormat(
+    is_hst1pass,
+    detections=lambda path, name: read_hst1pass(path).detections(name=name),
+    matches=lambda path, name: read_hst1pass(path).matches(name=name),
+    lacking=lambda path: [key for key in ("u", "v") if key not in read_hst1pass(path).columns],
+)
+MATCHUP = MatchFormat(is_matchup, master=read_matchup, lists="hst1pass")

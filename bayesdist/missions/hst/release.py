@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from bayesdist.calibration.calibration import Calibration
-from bayesdist.calibration.orientation import oriented
+from bayesdist.app.config.products import ReleaseBlock
+from bayesdist.app.products.release_set import ReleaseSet
+from bayesdist.calibration.calibration import Calibration, calibration_of
+from bayesdist.calibration.orientation import lay_on, oriented
 from bayesdist.calibration.plane import Orientation
 from bayesdist.errors import InputError
 from bayesdist.files.atomic import made_folder, refuse_unsafe_name
@@ -21,11 +23,18 @@ from bayesdist.formats.idctab.build import idctab_from_solution
 from bayesdist.formats.idctab.drift import Loss, storable
 from bayesdist.formats.idctab.hst import combination_of
 from bayesdist.formats.idctab.table import IdcTab, write_idctab
-from bayesdist.formats.lookup.d2im import write_d2im
+from bayesdist.formats.lookup.d2im import read_d2im, write_d2im
+from bayesdist.formats.lookup.file import read_lookup_file
 from bayesdist.formats.lookup.npol import write_npol
+from bayesdist.infer.solution.solution import Solution
+from bayesdist.infer.solution.transforms import reference_gauge, without_frames
 from bayesdist.model.lookup import LookupTable
+from bayesdist.products.registry import lint, read_calibration
 
 Filter = str | tuple[str, ...]
+
+INSTRUMENT, DETECTOR = "ACS", "WFC"  # of files whose configuration names none
+SCALE_ARCSEC = 0.05  # of their drizzled pixels
 
 
 @dataclass(frozen=True)
@@ -213,6 +222,81 @@ def write_release(
     return Release(idctabs, d2im, npol, lost)
 
 
+def write_files(
+    block: ReleaseBlock,
+    chip: int,
+    base: Path,
+    folder: Path,
+    solutions: Mapping[str, Solution],
+    tables: Sequence[LookupTable],
+    history: Sequence[str] = (),
+) -> list[dict[str, Any]]:
+    """Write the files of a release for one or several filters, as configured by one run.
+
+    Parameters
+    ----------
+    block : ReleaseBlock
+    chip : int
+        Chip that defines the gauge by its axes and zero point.
+    base : Path
+        Folder that file names in the configuration are relative to.
+    folder : Path
+        Folder to write to.
+    solutions : mapping of str to Solution
+        Solutions by filter.  The first one must be that of the configuration: V2 and V3 are
+        oriented as the reference states for it.
+    tables : sequence of LookupTable
+    history : sequence of str
+        Lines for HISTORY in all files.
+
+    Returns
+    -------
+    list of dict
+        One entry per file: path, kind, findings and, for an IDCTAB, period and lost.
+    """
+    calibrations = {
+        filter: calibration_of(
+            reference_gauge(without_frames(solution), chip), filter, filter=filter
+        )
+        for filter, solution in solutions.items()
+    }
+    first = next(iter(calibrations.values()))
+    time = first.model.time
+    scale_arcsec = block.scale_arcsec or SCALE_ARCSEC
+    orientation = lay_on(
+        first,
+        read_calibration(base / block.reference),
+        chip=chip,
+        epoch=None if time is None else time.epoch0[0],
+        scale_arcsec=scale_arcsec,
+    )
+    written = write_release(
+        folder,
+        block.name,
+        calibrations,
+        orientation,
+        [Period(**row.model_dump()) for row in block.period],
+        tables=tables,
+        instrument=block.instrument or INSTRUMENT,
+        detector=block.detector or DETECTOR,
+        scale_arcsec=scale_arcsec,
+        limit_mas=block.limit_mas,
+        history=history,
+    )
+    out: list[dict[str, Any]] = []
+    for period, path in written.idctabs.items():
+        lost = [asdict(row) for row in written.lost.get(period, ())]
+        out.append(_entry(path, "IDCTAB") | {"period": period, "lost": lost})
+    lookup_files = [] if written.d2im is None else [("D2IMFILE", written.d2im)]
+    lookup_files += [("NPOLFILE", path) for path in written.npol.values()]
+    return out + [_entry(path, kind) for kind, path in lookup_files]
+
+
+def _entry(path: Path, kind: str) -> dict[str, Any]:
+    findings = [f"{f.level}: {f.where}: {f.message}" for f in lint(path)]
+    return {"path": path.name, "kind": kind, "findings": findings}
+
+
 def _path(folder: Path, name: str, source: str) -> Path:
     """Path of a file of the release; `source` names the part of its name in the error message."""
     refuse_unsafe_name(name, where=f"{source} of the release")
@@ -266,3 +350,32 @@ def _check(
                 where="stand_ins",
                 do=available,
             )
+
+
+def read_calibrations(
+    entries: Sequence[Mapping[str, Any]], folder: Path, filter: str
+) -> dict[str, Calibration]:
+    """Calibrations with look-up tables of a filter, by the names of their periods."""
+    paths = {entry["kind"]: folder / entry["path"] for entry in entries}
+    before = read_d2im(paths["D2IMFILE"]) if "D2IMFILE" in paths else ()
+    npol = read_lookup_file(paths["NPOLFILE"]) if "NPOLFILE" in paths else None
+    sets = {}
+    for entry in entries:
+        if entry["kind"] == "IDCTAB":
+            calibration = read_calibration(folder / entry["path"], filter=filter)
+            tables = [] if npol is None else [npol.table(chip) for chip in npol.chips]
+            pixel = calibration.pixel()[0]
+            after = [replace(table, values=pixel * table.values, sigma=None) for table in tables]
+            sets[entry["period"]] = replace(calibration, before=tuple(before), after=tuple(after))
+    return sets
+
+
+RELEASE = ReleaseSet(
+    write_files,
+    read_calibrations,
+    kinds={
+        "IDCTAB": "IDCTAB: polynomial and its drift",
+        "D2IMFILE": "D2IMFILE: tables of the detector",
+        "NPOLFILE": "NPOLFILE: tables of the filter",
+    },
+)

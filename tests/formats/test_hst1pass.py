@@ -3,9 +3,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bayesdist.data import read_hst1pass, read_matches, read_matchup
+from bayesdist.data import read_matches
 from bayesdist.data.starlists import read_star_lists
 from bayesdist.errors import FormatError, InputError
+from bayesdist.formats.hst1pass import read_hst1pass, read_matchup
 
 LIST = """\
 # ARGUMENTS

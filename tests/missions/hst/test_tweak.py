@@ -17,15 +17,15 @@ import pytest
 from bayesdist.calibration.calibration import Calibration, calibration_of
 from bayesdist.data.sky import mean_direction, tangent_plane
 from bayesdist.diagnose.overlap import Alignment, align
+from bayesdist.missions.hst.release import Period, write_release
 from bayesdist.missions.hst.simulate.tables import detector_tables, filter_tables
 from bayesdist.model.lookup import LookupTable, corrected
-from bayesdist.products.release import Period, write_release
 from tests.reduced import only_in_full
 
-from .acs_offline import Pointing, plane_matrix
-from .acs_offline import corrected as corrected_by_stwcs
-from .stwcs_offline import gnomonic
-from .support import laid_on, turned_by
+from ...formats.acs_offline import Pointing, plane_matrix
+from ...formats.acs_offline import corrected as corrected_by_stwcs
+from ...formats.stwcs_offline import gnomonic
+from ...formats.support import laid_on, turned_by
 from .test_release import reference_of, solution_of
 
 CENTRE = (80.8, -69.49836)

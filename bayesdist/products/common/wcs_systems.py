@@ -1,4 +1,4 @@
-"""Text on the WCS of a FITS file or a text file of cards, in particular on SIP headers."""
+"""Text on the WCS of a FITS file or a text file of cards, as astropy.wcs reads it."""
 
 from __future__ import annotations
 
@@ -13,19 +13,17 @@ from astropy.io import fits
 from astropy.wcs import WCS, FITSFixedWarning
 
 from bayesdist.files.fits import RECORD
-from bayesdist.formats.sip.lint import lint_sip
-from bayesdist.formats.sip.read import image_size, parsed
-from bayesdist.formats.sip.text import coefficient_lines, sip_lines
-from bayesdist.formats.sip.wcs_sky import (
+from bayesdist.products.common.cards import holds_wcs
+from bayesdist.products.common.celestial import refuse_oversized
+from bayesdist.products.common.content import Content, Hdu
+from bayesdist.products.common.document import DistortionReader, Finding, finding_lines
+from bayesdist.products.common.linear_wcs import image_size
+from bayesdist.products.common.wcs_sky import (
     HeaderText,
     add_sky_lines,
     first_line,
     pv_keywords,
 )
-from bayesdist.products.common.cards import holds_wcs
-from bayesdist.products.common.celestial import refuse_oversized
-from bayesdist.products.common.content import Content, Hdu
-from bayesdist.products.common.document import Finding, finding_lines
 
 _WCS = re.compile(
     r"(CTYPE|CRVAL|CRPIX|CDELT|CUNIT|CROTA|LTV)\d+[A-Z]?$|(CD|PC|PV|PS|LTM)\d+_\d+[A-Z]?$|"
@@ -33,7 +31,6 @@ _WCS = re.compile(
 )
 
 # keywords that drizzling adds to its output image
-_DRIZZLED = ("NDRIZIM", "D001DATA", "D001SCAL", "D001PIXF")
 _TABLE_HDUS = ("D2IMARR", "WCSDVARR")
 _TABLES = ("CPDIS1", "CPDIS2", "D2IMDIS1", "D2IMDIS2", "AXISCORR")
 
@@ -44,13 +41,10 @@ def _wcs_cards(header: fits.Header) -> tuple[tuple[str, str], ...]:
     return tuple(sorted(cards))
 
 
-def describe_wcs(file: Content, extra: Sequence[Finding] = ()) -> list[str]:
-    """Lines of text on every world coordinate system of a file, with its findings.
-
-    `extra` findings on the file are listed with those of its first system. HDUs that repeat the
-    system of an earlier HDU are listed with that one. FormatError for SIP keywords that are missing
-    or not numbers.
-    """
+def describe_systems(
+    file: Content, extra: Sequence[Finding], distortion: DistortionReader | None
+) -> list[str]:
+    """Lines of text on a file; see `bayesdist.products.common.wcs_text.describe_wcs`."""
     extra = [*extra, *_truncated(file)]
     shown: dict[tuple[tuple[str, str], ...], list[Hdu]] = {}
     n_wcs = sum(holds_wcs(hdu.header) for hdu in file.hdus)
@@ -61,29 +55,16 @@ def describe_wcs(file: Content, extra: Sequence[Finding] = ()) -> list[str]:
             shown.setdefault((*_wcs_cards(hdu.header), _extent(hdu.header)), []).append(hdu)
     groups = list(shown.values())
     if len(file.hdus) == 1:
-        return _hdu_lines(file, groups[0][0], file.name, extra=extra)
+        return _hdu_lines(file, groups[0][0], file.name, extra=extra, distortion=distortion)
     out = [f"{file.name}: {n_wcs} HDUs with a WCS, {len(groups)} different"]
     for first, *repeats in groups:
-        out += ["", *_hdu_lines(file, first, _label(first), repeats, extra)]
+        out += ["", *_hdu_lines(file, first, _label(first), repeats, extra, distortion)]
         extra = ()
     return out
 
 
 def _extent(header: fits.Header) -> tuple[str, str]:
     return "size", str(image_size(header))
-
-
-def _left_over(header: fits.Header) -> Iterator[Finding]:
-    """Finding on SIP coefficients in the header of a drizzled image, which has no distortion."""
-    drizzled = [key for key in _DRIZZLED if key in header]
-    if drizzled:
-        yield Finding(
-            "warning",
-            "A_ORDER, B_ORDER",
-            f"SIP coefficients beside {drizzled[0]}: the image was drizzled, which removes the "
-            "distortion, and the coefficients of an input image may be left over: they are "
-            "applied here; delete them if so",
-        )
 
 
 def _truncated(file: Content) -> Iterator[Finding]:
@@ -113,15 +94,16 @@ def _hdu_lines(
     name: str,
     others: Sequence[Hdu] = (),
     extra: Sequence[Finding] = (),
+    distortion: DistortionReader | None = None,
 ) -> list[str]:
     """Lines of text on one HDU."""
     header, text, terms = hdu.header, HeaderText(findings=list(extra)), list[str]()
     size = image_size(header)
-    if "A_ORDER" in header:
-        sip = parsed(header, name)
-        text.lines += sip_lines(sip, name)
-        terms = coefficient_lines(sip)
-        text.findings += [*lint_sip(sip), *_left_over(header)]
+    described = None if distortion is None else distortion(header, name)
+    if described is not None:
+        text.lines += described.lines
+        terms += described.terms
+        text.findings += described.findings
     else:
         extent = "unknown" if size is None else f"{size[0]} x {size[1]} px"
         text.lines.append(f"{name}: WCS, image size {extent}")

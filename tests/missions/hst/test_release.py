@@ -20,16 +20,16 @@ from bayesdist.formats.idctab.hst import combination_of
 from bayesdist.formats.idctab.lint import lint_idctab
 from bayesdist.formats.idctab.table import read_idctab
 from bayesdist.infer.solution.transforms import reference_gauge
+from bayesdist.missions.hst.release import Period, Release, write_release
 from bayesdist.missions.hst.simulate import acs_solution
 from bayesdist.missions.hst.simulate.tables import detector_tables, filter_tables
 from bayesdist.model.lookup import LookupTable, corrected
-from bayesdist.products.release import Period, Release, write_release
 from tests.reduced import case_in_full
 
-from .acs_offline import Pointing, to_sky
-from .acs_offline import corrected as corrected_by_stwcs
-from .stwcs_offline import separation_mas
-from .support import StandIn, laid_on, random_pixels, some_covariance, turned_by
+from ...formats.acs_offline import Pointing, to_sky
+from ...formats.acs_offline import corrected as corrected_by_stwcs
+from ...formats.stwcs_offline import separation_mas
+from ...formats.support import StandIn, laid_on, random_pixels, some_covariance, turned_by
 
 ACS = {"instrument": "ACS", "detector": "WFC"}
 PERIODS = (
