@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
+from bayesdist.app.store.lock import LOCK
 from bayesdist.app.store.store import ArtefactStore
 from tests.app.support import good
 from tests.kills.compare import assert_same, assert_whole
@@ -96,7 +97,8 @@ def _copied_at_each_stage(folder: Path) -> Iterator[None]:
 
     def copying(self: ArtefactStore, record: Any, name: str, *arguments: Any) -> None:
         begin(self, record, name, *arguments)
-        shutil.copytree(self.path, folder / name / "run")
+        without_lock = shutil.ignore_patterns(LOCK)
+        shutil.copytree(self.path, folder / name / "run", ignore=without_lock)
 
     with patch.object(ArtefactStore, "_begin", copying):
         yield
