@@ -241,17 +241,21 @@ def test_runs_in_two_folders_are_the_same_but_for_dates_and_durations(tmp_path, 
     first, second = (snapshot(run) for run in runs)
     assert first.keys() == second.keys()
     other = {name for name in first if first[name] != second[name]}
-    assert other <= TIMED | {"posterior.nc", "maps.fits"}
+    # h5py before 3.14 writes the time into the headers of groups
+    assert other <= TIMED | {"fit.nc", "posterior.nc", "maps.fits"}
     for name in TIMED:
         texts = [TIMES.sub("", (run / name).read_text(encoding="utf-8")) for run in runs]
         assert str(tmp_path) not in texts[0] and texts[0] == texts[1], name
-    groups = [netcdf_groups(run / "posterior.nc") for run in runs]
-    for name, group in groups[0].items():
-        same = groups[1][name]
-        assert all(np.array_equal(group.arrays[k], same.arrays[k]) for k in group.arrays)
-        texts = [{k: TIMES.sub("", str(v)) for k, v in g.attrs.items()} for g in (group, same)]
-        differ = {k for k in texts[0] if texts[0][k] != texts[1][k]}
-        assert differ <= {"wall_s"}, name
+    for file in ("fit.nc", "posterior.nc"):
+        groups = [netcdf_groups(run / file) for run in runs]
+        assert groups[0].keys() == groups[1].keys()
+        for name, group in groups[0].items():
+            same = groups[1][name]
+            assert group.arrays.keys() == same.arrays.keys()
+            assert all(np.array_equal(group.arrays[k], same.arrays[k]) for k in group.arrays)
+            texts = [{k: TIMES.sub("", str(v)) for k, v in g.attrs.items()} for g in (group, same)]
+            differ = {k for k in texts[0] if texts[0][k] != texts[1][k]}
+            assert differ <= {"wall_s"}, (file, name)
     maps = [str(run / "maps.fits") for run in runs]
     diff = FITSDiff(*maps, ignore_keywords=["CHECKSUM"], ignore_comments=["DATASUM"])
     assert diff.identical, diff.report()
