@@ -31,12 +31,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.data.tables.checks import Place, row_number, zero_motions
-from bayesdist.data.tables.column import Quantities, SourceColumn
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Bool, Float
 
 if TYPE_CHECKING:
     from astropy.time import Time
+
+    from bayesdist.data.tables.column import Quantities, SourceColumn
 
 MOTIONS = ("pm_ra", "pm_dec", "sigma_pm_ra", "sigma_pm_dec")
 # quantities that may be missing for a star, which then count as zero

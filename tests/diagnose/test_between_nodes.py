@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from bayesdist.diagnose import tables as between_nodes
+from bayesdist.diagnose.tables import between_nodes
 from bayesdist.errors import DegenerateError
 from bayesdist.infer.nodes import Matern, NodeGrid, field_table
 from bayesdist.model import Chip

@@ -40,6 +40,10 @@ GOOD, WORSE = 0.98, 0.8
 VAGUE = 0.2  # standard deviation of log s_out above which a single Gaussian is not enough
 # multiple of the median quoted error beyond which the marginal may be the tail of the prior
 FAR = {"j": 0.3, "s_out": 30.0}
+MEANING = {
+    "j": "the additional scatter of true matches (jitter)",
+    "s_out": "the scatter of false matches",
+}
 
 
 def build_proposal(target: Target, fit: LinearFit) -> GridProposal:
@@ -223,9 +227,12 @@ def _walk(target: Target, split: Split, nodes: Line, axis: int, direction: int) 
             np.clip(step * np.clip((2.0 / max(abs(change), 0.25)) ** 0.7, 0.2, 4.0), 1e-7, 1.0)
         )
     raise DegenerateError(
-        f"the posterior of {split.held[axis]} has no end",
+        f"the data do not bound {MEANING[split.held[axis]]}: its posterior is not negligible at "
+        f"{np.exp(outermost(nodes)):.2g}, with typical errors of {target.hyper.scale:.2g}, in the "
+        "unit of u and v",
         where="outliers",
-        do="check the units of the errors",
+        do="check the unit of u, v and their errors, and that the order of the model and the match "
+        "radius suit the matches",
     )
 
 

@@ -225,7 +225,6 @@ class Skewed(Solution):
     mean: np.ndarray
     cov: np.ndarray
     convergence = "judged"
-    approximation = ""
 
     def draws(self, n, rng):
         z = (rng.gamma(4.0, size=(n, self.mean.size)) - 4.0) / 2.0

@@ -56,7 +56,6 @@ class Gaussian(Solution):
 
 class Judged(Gaussian):
     convergence = "judged"
-    approximation = ""
 
 
 def acs(seed=1, *, angle=0.0, shift=(0.0, 0.0), kind=Gaussian, frames="affine"):
