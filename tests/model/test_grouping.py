@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from bayesdist.model.effective import Groups, group_by, merge_groups
@@ -41,7 +41,6 @@ def test_groups_are_those_of_equal_keys(kinds):
         assert (groups.index[rows] == g).all()
 
 
-@settings(deadline=None)
 @given(keys)
 def test_groups_are_numbered_in_the_order_of_their_keys(members):
     """Chip before exposure before epoch, however the stars stand: as numpy sorts whole keys."""
@@ -52,7 +51,6 @@ def test_groups_are_numbered_in_the_order_of_their_keys(members):
     np.testing.assert_array_equal(groups.index, index)
 
 
-@settings(deadline=None)
 @given(keys, keys)
 def test_merged_groups_are_the_union_in_the_order_of_the_whole(a, b):
     one, two = groups_of(a), groups_of(b)
@@ -65,7 +63,6 @@ def test_merged_groups_are_the_union_in_the_order_of_the_whole(a, b):
     assert [keys_of(merged)[k] for k in of_two] == keys_of(two)
 
 
-@settings(deadline=None)
 @given(keys, keys, keys)
 def test_merging_may_be_done_in_any_order(a, b, c):
     one, two, three = groups_of(a), groups_of(b), groups_of(c)
@@ -75,7 +72,6 @@ def test_merging_may_be_done_in_any_order(a, b, c):
     assert merge_groups(left, left)[0].same(left)
 
 
-@settings(deadline=None)
 @given(keys, keys)
 def test_same_groups_are_those_of_equal_keys(a, b):
     assert groups_of(a).same(groups_of(b)) == (sorted(set(a)) == sorted(set(b)))

@@ -152,7 +152,7 @@ def _harm(job: Job, how: str, number: int) -> None:
         path.write_bytes(b"9" + content[1:] if how == "alter" else content[:-1])
 
 
-@settings(max_examples=40 if FULL else 12, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=40 if FULL else 12, suppress_health_check=list(HealthCheck))
 @given(st.lists(action, max_size=12))
 def test_it_ends_as_a_fresh_run(actions):
     wanted = {key: low for key, (low, _) in SETTINGS.items()}
