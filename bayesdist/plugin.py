@@ -60,7 +60,7 @@ class Plugin:
     ----------
     kinds : mapping of str to str
         Kinds of runs by the section of the configuration that they begin with; each object is the
-        class of that configuration, a subclass of `bayesdist.app.config.RunConfig`.
+        class of that configuration, a subclass of `bayesdist.app.config.StarsConfig`.
     formats : mapping of str to str
         Formats of calibration files by key; each object is a
         `bayesdist.products.common.document.Format`.
@@ -96,20 +96,24 @@ def missions() -> dict[str, Mission]:
     }
 
 
-def objects(targets: Callable[[Plugin], Mapping[str, str]]) -> dict[str, Any]:
+def objects(
+    targets: Callable[[Plugin], Mapping[str, str]], *, flaw: Callable[[Any], str] = lambda _: ""
+) -> dict[str, Any]:
     """Import the objects that plugins give in one of their fields.
 
     Parameters
     ----------
     targets : callable
         ``targets(plugin)`` returns "module:object" by name, such as ``plugin.formats``.
+    flaw : callable
+        ``flaw(object)`` returns why an object cannot be used, as a clause; empty if it can.
 
     Returns
     -------
     dict
-        Objects by name. Those that cannot be imported are left out with a warning.
+        Objects by name. Those that cannot be imported or used are left out with a warning.
     """
-    return dict(_loaded({name: targets(plugin) for name, plugin in plugins().items()}))
+    return dict(_loaded({name: targets(plugin) for name, plugin in plugins().items()}, flaw))
 
 
 def mission_objects(
@@ -147,12 +151,18 @@ def _entries() -> list[EntryPoint]:
     return [entry for entry in entries if names is None or entry.name in names]
 
 
-def _loaded(targets: Mapping[str, Mapping[str, str]]) -> Iterator[tuple[str, Any]]:
-    """Names and objects by the names of their plugins, without those that cannot be imported."""
+def _loaded(
+    targets: Mapping[str, Mapping[str, str]], flaw: Callable[[Any], str] = lambda _: ""
+) -> Iterator[tuple[str, Any]]:
+    """Names and objects by the names of their plugins, without those that cannot be used."""
     for plugin, by_name in targets.items():
         for name, where in by_name.items():
             loaded = _attempt(plugin, where, partial(load_object, where))
-            if loaded is not None:
+            if loaded is None:
+                continue
+            if reason := flaw(loaded):
+                _warn(plugin, where, reason)
+            else:
                 yield name, loaded
 
 

@@ -46,8 +46,7 @@ def read_calibration(
         A calibration file (its format is recognized by its content), the folder of a run, or the
         ``posterior.nc`` or ``fit.nc`` in it.
     filter : str, optional
-        Filter or band, if the file has several; names in two wheels are joined by a comma
-        meta-data.  Needed if the file has several.
+        Filter or band, if the file has several; names in two wheels are joined by a comma.
     size : tuple of float, optional
         Number of columns and rows.  Needed for a header that does not state them.
 

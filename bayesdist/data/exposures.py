@@ -72,7 +72,7 @@ class Exposure:
     ------
     InputError
         If the name is empty, if a number is not finite or outside its plausible range, or if
-        The factor is too far from 1 for any orbit around the Earth.
+        the factor is too far from 1 for any orbit around the Earth.
     """
 
     name: str

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from bayesdist.calibration.calibration import Calibration
+from bayesdist.calibration.plane import ARCSEC
 from bayesdist.data import Matches
 from bayesdist.diagnose.residuals.binned import BinnedResiduals, binned_residuals
 from bayesdist.infer.solution.solution import Solution
@@ -204,7 +205,7 @@ def _known_plane(known: Calibration, pairs: Matches, rows: Int, epoch: float) ->
         on_chip = chips == number
         x, y = pairs.x[rows[on_chip]], pairs.y[rows[on_chip]]
         out[on_chip] = known.forward(x, y, chip=int(number), epoch=then)
-    return out
+    return out * ARCSEC[known.unit]
 
 
 def _solved_plane(

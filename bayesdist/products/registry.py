@@ -37,8 +37,15 @@ if TYPE_CHECKING:
 @cache
 def all_formats() -> tuple[Format, ...]:
     """All formats, in the order in which they are tried on a file."""
-    formats = objects(lambda plugin: plugin.formats).values()
+    formats = objects(lambda plugin: plugin.formats, flaw=_flaw).values()
     return tuple(sorted(formats, key=lambda format_: (format_.rank, format_.key)))
+
+
+def _flaw(format_: object) -> str:
+    """Why an object cannot be used as a format; empty if it can."""
+    if isinstance(format_, Format):
+        return ""
+    return "it is not a bayesdist.products.common.document.Format"
 
 
 def open_document(path: str | os.PathLike[str]) -> Document:

@@ -109,6 +109,8 @@ def test_an_interrupt_in_a_destructor_is_not_lost():
     code = (
         "import signal, sys, time, click\n"
         "from bayesdist.app import cli\n"
+        # jobs in the background inherit that SIGINT is ignored
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "class Open:\n"
         "    def __del__(self): signal.raise_signal(signal.{})\n"
         "@click.command()\n"

@@ -1,7 +1,7 @@
 """Positions: errors of any at any date are covered, and exposures are laid on each other.
 
 Alignment is the claim of ACS ISR 2015-06, sections 6 and 7; through files and stwcs it is shown in
-tests/formats/test_tweak.py.
+tests/missions/hst/test_tweak.py.
 """
 
 from __future__ import annotations

@@ -29,7 +29,15 @@ from bayesdist.utils.text import refuse_control_characters
 def _installed_kinds() -> dict[str, type[RunConfig]]:
     """Configurations of this and of other packages, by the section that determines the kind."""
     ours = {"data": MatchesConfig, "campaign": CampaignConfig, "selfcal": SelfcalConfig}
-    return {**objects(lambda plugin: plugin.kinds), **ours}
+    return {**objects(lambda plugin: plugin.kinds, flaw=_flaw), **ours}
+
+
+def _flaw(kind: object) -> str:
+    """Why an object cannot be the configuration of a kind; empty if it can."""
+    if not (isinstance(kind, type) and issubclass(kind, RunConfig)):
+        return "it is not a subclass of bayesdist.app.config.StarsConfig"
+    missing = [name for name in ("title", "kind") if not hasattr(kind, name)]
+    return f"it has no attribute {missing[0]!r}" if missing else ""
 
 
 KINDS = _installed_kinds()

@@ -138,9 +138,14 @@ def _refuse_off_chip(x: Float, y: Float, chip: Chip, where: str) -> None:
         )
 
 
-def known_calibration(document: Document, filter: str | None) -> Calibration:
-    """Calibration of a file in a filter, or without a filter if it does not list that one."""
-    return document.calibration(Choice(filter if filter in document.filters() else None))
+def known_calibration(
+    document: Document, filter: str | None, size: tuple[float, float] | None
+) -> Calibration:
+    """Calibration of a file in a filter, or without a filter if it does not list that one.
+
+    `size` is that of the detector, for files that do not state it.
+    """
+    return document.calibration(Choice(filter if filter in document.filters() else None, size))
 
 
 def start_of(calibration: Calibration, unit_arcsec: float) -> Start:

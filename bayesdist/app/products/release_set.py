@@ -64,6 +64,12 @@ def release_set() -> ReleaseSet:
             where="products.release",
             do="install a mission that does, or leave the section out",
         )
+    if len(sets) > 1:
+        raise InputError(
+            f"several missions release files: {', '.join(sorted(sets))}",
+            where="products.release",
+            do="name the plugin of one of them in the environment variable BAYESDIST_PLUGINS",
+        )
     found: ReleaseSet = next(iter(sets.values()))
     return found
 

@@ -22,7 +22,7 @@ from bayesdist.files.atomic import made_folder, refuse_unsafe_name
 from bayesdist.formats.idctab.build import idctab_from_solution
 from bayesdist.formats.idctab.drift import Loss, storable
 from bayesdist.formats.idctab.hst import combination_of
-from bayesdist.formats.idctab.table import IdcTab, write_idctab
+from bayesdist.formats.idctab.table import IdcTab, read_idctab, write_idctab
 from bayesdist.formats.lookup.d2im import read_d2im, write_d2im
 from bayesdist.formats.lookup.file import read_lookup_file
 from bayesdist.formats.lookup.npol import write_npol
@@ -254,6 +254,8 @@ def write_files(
     list of dict
         One entry per file: path, kind, findings and, for an IDCTAB, period and lost.
     """
+    # only an IDCTAB has the V2 and V3 axes that the files are laid on
+    read_idctab(base / block.reference)
     calibrations = {
         filter: calibration_of(
             reference_gauge(without_frames(solution), chip), filter, filter=filter

@@ -145,7 +145,7 @@ def _new_matches(run: RunDirectory, config: Config, new: Path) -> tuple[Matches,
         path, size, chips = new, config.detector.size, config.chip
         if not isinstance(config, MatchesConfig):  # other kinds read no tables of matches
             raise InputError(
-                "is a table, and a self-calibration has not said how to read one",
+                "is a table, and this kind of run has no [data] that says how to read it",
                 where=str(new),
                 do="give a configuration whose [data] names it",
             )
@@ -358,7 +358,8 @@ def fit_new_exposures(release: Results, new: Path) -> tuple[Matches, NewFit, tup
     pairs = _pairs(run, new, released.model.unit)
     if not pairs.has_epoch:
         raise InputError("has no epochs", where=str(new), do="give a column 'epoch'")
-    _refuse_other_filters(config, pairs, ", ".join(pairs.sources))
+    if isinstance(config, CampaignConfig):
+        _refuse_other_filters(config, pairs, ", ".join(pairs.sources))
     is_released = np.isin(pairs.exposure_names, released.model.exposures)
     left_out = tuple(np.asarray(pairs.exposure_names)[is_released].tolist())
     fresh = ~is_released[pairs.exposure]
@@ -415,8 +416,8 @@ def _pairs(run: RunDirectory | None, new: Path, unit: str) -> Matches:
     return pairs
 
 
-def _refuse_other_filters(config: Config, pairs: Matches, where: str) -> None:
-    mine = config.filter_name or None
+def _refuse_other_filters(config: CampaignConfig, pairs: Matches, where: str) -> None:
+    mine = config.campaign.filter
     other_filters = sorted({name for name in pairs.filter_names if name} - {mine})
     if mine is not None and other_filters:
         raise InputError(

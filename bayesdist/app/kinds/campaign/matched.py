@@ -71,7 +71,7 @@ class CampaignMatched(Matched):
         return overlap_test(
             self.stars,
             posterior,
-            known_calibration(initial, block.filter),
+            known_calibration(initial, block.filter, inputs.config.detector.size),
             tables,
             unit_arcsec=inputs.unit_arcsec,
             pixel=inputs.pixel_arcsec,

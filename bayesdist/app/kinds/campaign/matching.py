@@ -44,8 +44,9 @@ def match_lists(inputs: Inputs) -> CampaignMatched:
     """Match star lists with a catalogue, exposure by exposure."""
     config, block, lists = inputs.config, inputs.config.campaign, inputs.star_lists
     document = open_document(inputs.base / block.initial_distortion)
-    initial = known_calibration(document, block.filter)
+    initial = known_calibration(document, block.filter, config.detector.size)
     parities = parities_of(block, inputs.catalog, document)
+    states_parity = block.parity != "auto" or document.mirrored() is not None
     for text in (*([inputs.plane] if inputs.plane else []), *inputs.catalog.notes):
         log.info("match: catalogue: %s", text)
     start = start_of(initial, inputs.unit_arcsec)
@@ -64,7 +65,11 @@ def match_lists(inputs: Inputs) -> CampaignMatched:
         refuse_few(remaining.values("epoch"), config.time())
     table = _table(matches, inputs.log)
     warnings = [
-        *_doubtful_parity(matches.mirrored, parities, _detector_of(initial)),
+        *(
+            _doubtful_parity(matches.mirrored, parities, _detector_of(initial))
+            if states_parity
+            else []
+        ),
         *matches.warnings(inputs.log),
         *input_warnings(inputs),
         # roll angles of the matches, because the log need not have them
@@ -201,7 +206,7 @@ def campaign_lines(inputs: Inputs) -> Iterator[str]:
     chips = ", ".join(chip.name for chip in config.chips())
     yield f"model        order {config.model.order}, chips {chips}, tables: {config.tables.method}"
     document = open_document(inputs.base / config.campaign.initial_distortion)
-    initial = known_calibration(document, config.campaign.filter)
+    initial = known_calibration(document, config.campaign.filter, config.detector.size)
     for number in sorted({chip.number for chip in config.chips()} & set(initial.numbers)):
         sentence = geometry_of(initial.solution, number).sentence
         yield f"geometry     chip {number} of campaign.initial_distortion: {sentence}"

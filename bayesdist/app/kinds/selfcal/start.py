@@ -140,7 +140,8 @@ def _first(
             where=str(path),
             do="set detector.scale_mas",
         )
-    return start_of(known_calibration(open_document(path), None), unit_arcsec)
+    size = chips[0].size if len(chips) == 1 else None
+    return start_of(known_calibration(open_document(path), None, size), unit_arcsec)
 
 
 def _onto_references(
