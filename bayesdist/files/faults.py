@@ -27,12 +27,12 @@ def raising_interrupts() -> Iterator[None]:
     HDF5, for example, raises a SystemError. An interrupt that a script was already handling before
     does not count.
     """
-    before, handler = sys.exception(), signal.getsignal(signal.SIGINT)
-    n_before = handler.n if isinstance(handler, InterruptHandler) else 0
+    before, handler = sys.exception(), installed_handler()
+    n_before = 0 if handler is None else handler.n
     try:
         yield
     except Exception as error:
-        noted = isinstance(handler, InterruptHandler) and handler.n > n_before
+        noted = handler is not None and handler.n > n_before
         if noted or _comes_of_interrupt(error, before):
             raise KeyboardInterrupt from error
         raise
@@ -57,12 +57,13 @@ class InterruptHandler:
         """Raise the interrupt, unless it follows another one soon."""
         self.n += 1
         self.terminated |= number == signal.SIGTERM
-        self.deferred = self.deferring
-        if self.deferring:
-            return
         now = time.monotonic()
-        if now - self._last > self.again:
-            self._last = now
+        if now - self._last <= self.again:
+            return
+        self._last = now
+        if self.deferring:
+            self.deferred = True
+        else:
             raise KeyboardInterrupt
 
     def repeat_lost(self, unraisable: Any) -> None:
@@ -77,6 +78,18 @@ class InterruptHandler:
         self._last = -math.inf
         number = signal.SIGTERM if self.terminated else signal.SIGINT
         threading.Timer(REPEAT, _signal_main_thread, [number]).start()
+
+
+def installed_handler() -> InterruptHandler | None:
+    """Handler of this program; None if there is none.
+
+    Jobs in the background ignore SIGINT, so that only SIGTERM may have it.
+    """
+    for number in (signal.SIGINT, signal.SIGTERM):
+        handler = signal.getsignal(number)
+        if isinstance(handler, InterruptHandler):
+            return handler
+    return None
 
 
 def _signal_main_thread(number: signal.Signals) -> None:
@@ -109,9 +122,9 @@ def deferred_interrupts() -> Iterator[None]:
 
     HDF5 prints a traceback if a callback is interrupted.
     """
-    handler = signal.getsignal(signal.SIGINT)
+    handler = installed_handler()
     main = threading.current_thread() is threading.main_thread()
-    if not main or not isinstance(handler, InterruptHandler) or handler.deferring:
+    if not main or handler is None or handler.deferring:
         yield
         return
     handler.deferring = True

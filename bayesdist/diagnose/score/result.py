@@ -28,6 +28,7 @@ HeldBy = Literal[
     "", "noise", "structure", "exposures", "curvature", "second order", "exposure fields", "time"
 ]
 LOOK_UP_TABLE = "fit a look-up table in a campaign"  # remedy that is available to campaigns only
+MISSING_ORDERS = "missing orders"  # name of the test for all further orders
 POWER = 0.9  # probability of detecting an effect of the stated smallest size
 # p-value below which a few of many functions are regarded as the common cause
 LEADING_CHANCE = 0.01
@@ -216,9 +217,16 @@ def _causes(significant: Mapping[str, Family], outcomes: Sequence[Outcome]) -> d
     by_name = {result.name: (result.statistic, result.dof) for result in outcomes}
     singles = ("second order of exposures", "exposures")
     single = [by_name[name] for name in singles if name in significant]
-    orders = [by_name[result.name] for result in outcomes if result.family.group == "orders"]
-    total = sum(statistic for statistic, _ in orders), sum(dof for _, dof in orders)
-    rivals = {"pointing": single, "edges": [total] if orders else []}
+    of_orders = [result for result in outcomes if result.family.group == "orders"]
+    next_orders = [result for result in of_orders if result.name != MISSING_ORDERS]
+    further = [result for result in of_orders if result.name == MISSING_ORDERS]
+    total = (
+        sum(result.statistic for result in next_orders),
+        sum(result.dof for result in next_orders),
+    )
+    orders = [total] if next_orders else []
+    orders += [by_name[result.name] for result in further]
+    rivals = {"pointing": single, "edges": orders}
     weaker = {
         name
         for name, competitors in rivals.items()
@@ -227,7 +235,11 @@ def _causes(significant: Mapping[str, Family], outcomes: Sequence[Outcome]) -> d
     }
     # Terms of a missing order contain steps and rings that are smaller than the terms themselves,
     # whereas polynomials follow a true step or ring only in part.
-    orders_square = sum(result.size**2 for result in outcomes if result.family.group == "orders")
+    # The robust fit includes the next orders.
+    orders_square = max(
+        sum(result.size**2 for result in several if result.name in significant)
+        for several in (next_orders, further)
+    )
     steep = {
         result.name: result.statistic
         for result in outcomes

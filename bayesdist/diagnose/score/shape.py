@@ -122,7 +122,7 @@ def _symmetric_chips(
     free = _free_radius(sample)
     for chip in chips:
         order = chip.order_above(HIGHER)
-        if order == chip.order or chip.missing_orders is not None:
+        if order == chip.order or _lacks_more_than(chip, order):
             continue
         part = chip.without_terms(order)
         if chip.scatter() > MOST_MISSING * part.scatter():
@@ -134,6 +134,12 @@ def _symmetric_chips(
             part = part.at(np.flatnonzero((reach > FREE) & (np.hypot(*part.z) < reach)))
         if part.n_stars >= MIN_STARS:
             yield part
+
+
+def _lacks_more_than(chip: ChipResiduals, order: int) -> bool:
+    """True if the residuals contain terms of higher orders than `order`."""
+    missing = chip.missing_orders
+    return missing is not None and missing.order > order
 
 
 def _free_radius(sample: ScoredSample) -> Float | None:

@@ -11,13 +11,14 @@ from bayesdist.diagnose.score.motions import gap_test, motion_test
 from bayesdist.diagnose.score.noise import noise_tests
 from bayesdist.diagnose.score.patterns import jump_test, pattern_test, ring_test
 from bayesdist.diagnose.score.projection import projection_of, regressor_tests
-from bayesdist.diagnose.score.questions import functions_for
+from bayesdist.diagnose.score.questions import HIGHER, functions_for
 from bayesdist.diagnose.score.result import ScoreTest, corrected
 from bayesdist.diagnose.score.sample import SAMPLE, scored_sample
 from bayesdist.diagnose.score.shape import shape_tests
 from bayesdist.diagnose.score.truncation import radius_test, truncation_test
 from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.solution.solution import Solution
+from bayesdist.utils.limits import SCORE_TESTS
 
 
 def score_tests(
@@ -64,12 +65,20 @@ def score_tests(
     )
     sample = projection.scored
     chips = chip_residuals(sample)
+    regressed = regressor_tests(projection)
+    order = sample.model.order
+    found_orders = [
+        k
+        for k in range(order + 1, order + HIGHER + 1)
+        for result in regressed
+        if result.name == f"order {k}" and result.p_value < SCORE_TESTS.value / len(regressed)
+    ]
     outcomes = [
         truncation_test(sample, match_radius),
         radius_test(sample),
         *shape_tests(sample, chips),
-        *regressor_tests(projection),
-        missing_orders_test(sample, chips),
+        *regressed,
+        missing_orders_test(sample, chips, max(found_orders, default=order)),
         gap_test(projection),
         jump_test(sample),
         motion_test(sample),
