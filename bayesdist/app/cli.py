@@ -16,7 +16,7 @@ import click
 from bayesdist.app.commands.options import LazyGroup
 from bayesdist.app.screen import open_streams
 from bayesdist.errors import BayesdistError, BayesdistWarning, RenamedError
-from bayesdist.files.faults import InterruptHandler, raising_interrupts
+from bayesdist.files.faults import InterruptHandler, installed_handler, raising_interrupts
 from bayesdist.plugin import mission_objects, missions
 from bayesdist.version import __version__
 
@@ -183,8 +183,8 @@ def _exit_code(call: Callable[[], int | None], command: str) -> int:
         print(f"bayesdist: {sentence}", file=sys.stderr)
         return error.exit_code
     except (KeyboardInterrupt, click.Abort):
-        handler = signal.getsignal(signal.SIGTERM)
-        terminated = isinstance(handler, InterruptHandler) and handler.terminated
+        handler = installed_handler()
+        terminated = handler is not None and handler.terminated
         what, code = ("terminated", TERMINATED) if terminated else ("interrupted", INTERRUPTED)
         print(f"bayesdist: {what}; resume with --resume", file=sys.stderr)
         return code

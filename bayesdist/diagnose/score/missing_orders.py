@@ -78,12 +78,13 @@ class ChipResiduals:
         for code in np.unique(self.exposure):
             yield self.at(np.flatnonzero(self.exposure == code))
 
-    def order_above(self, number: int) -> int:
-        """Highest order, at most `number` above the model's, that the stars constrain."""
-        for total in range(self.order + number, self.order, -1):
-            if STARS_PER_TERM * n_terms(total) <= self.n_stars:
-                return total
-        return self.order
+    def orders(self, highest: int, stars_per_term: int = STARS_PER_TERM) -> list[int]:
+        """Order of the model, and those above it up to `highest` that the stars constrain."""
+        return [self.order] + [
+            order
+            for order in range(self.order + 1, highest + 1)
+            if stars_per_term * n_terms(order) <= self.n_stars
+        ]
 
     def scatter(self, *, weighted: bool = False) -> float:
         """Scatter per axis, from the median of the squares; weighted by `inlier` if asked for."""
@@ -114,12 +115,7 @@ class ChipResiduals:
         """Orders that the residuals contain, from a robust fit; None without evidence for any."""
         step = -(-len(self.rows) // MAX_DETECTIONS)
         part = self.at(np.flatnonzero(self.star % step == 0)) if step > 1 else self
-        orders = [self.order]
-        orders += [
-            order
-            for order in range(self.order + 1, MAX_ORDER + 1)
-            if STARS_PER_FITTED_TERM * n_terms(order) <= part.n_stars
-        ]
+        orders = part.orders(MAX_ORDER, STARS_PER_FITTED_TERM)
         fits = [part.without_terms(order) for order in orders]
         variance = np.array([(fit.scatter() ** 2 / fit.free) for fit in fits])
         if variance.min() > LARGEST_RATIO**2 * variance[0]:

@@ -121,7 +121,7 @@ def _symmetric_chips(
     """Iterate over the residuals of the chips that can be tested, without their missing terms."""
     free = _free_radius(sample)
     for chip in chips:
-        order = chip.order_above(HIGHER)
+        order = chip.orders(chip.order + HIGHER)[-1]
         if order == chip.order or _lacks_more_than(chip, order):
             continue
         part = chip.without_terms(order)

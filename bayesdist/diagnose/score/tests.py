@@ -11,7 +11,7 @@ from bayesdist.diagnose.score.motions import gap_test, motion_test
 from bayesdist.diagnose.score.noise import noise_tests
 from bayesdist.diagnose.score.patterns import jump_test, pattern_test, ring_test
 from bayesdist.diagnose.score.projection import projection_of, regressor_tests
-from bayesdist.diagnose.score.questions import HIGHER, functions_for
+from bayesdist.diagnose.score.questions import HIGHER, functions_for, order_family
 from bayesdist.diagnose.score.result import ScoreTest, corrected
 from bayesdist.diagnose.score.sample import SAMPLE, scored_sample
 from bayesdist.diagnose.score.shape import shape_tests
@@ -66,19 +66,23 @@ def score_tests(
     sample = projection.scored
     chips = chip_residuals(sample)
     regressed = regressor_tests(projection)
+    level = SCORE_TESTS.value / max(len(regressed), 1)
+    significant = {result.name for result in regressed if result.p_value < level}
     order = sample.model.order
-    found_orders = [
-        k
-        for k in range(order + 1, order + HIGHER + 1)
-        for result in regressed
-        if result.name == f"order {k}" and result.p_value < SCORE_TESTS.value / len(regressed)
-    ]
+    at_least = max(
+        (
+            total
+            for total in range(order, order + HIGHER + 1)
+            if order_family(total, order).name in significant
+        ),
+        default=order,
+    )
     outcomes = [
         truncation_test(sample, match_radius),
         radius_test(sample),
         *shape_tests(sample, chips),
         *regressed,
-        missing_orders_test(sample, chips, max(found_orders, default=order)),
+        missing_orders_test(sample, chips, at_least),
         gap_test(projection),
         jump_test(sample),
         motion_test(sample),

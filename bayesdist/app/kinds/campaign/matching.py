@@ -35,6 +35,7 @@ from bayesdist.data.matching.campaign import CampaignMatches
 from bayesdist.errors import InputError
 from bayesdist.infer.solution.geometry import geometry_of
 from bayesdist.model import Chip
+from bayesdist.products.common.document import Document
 from bayesdist.products.registry import open_document
 
 log = logging.getLogger("bayesdist")
@@ -46,7 +47,6 @@ def match_lists(inputs: Inputs) -> CampaignMatched:
     document = open_document(inputs.base / block.initial_distortion)
     initial = known_calibration(document, block.filter, config.detector.size)
     parities = parities_of(block, inputs.catalog, document)
-    states_parity = block.parity != "auto" or document.mirrored() is not None
     for text in (*([inputs.plane] if inputs.plane else []), *inputs.catalog.notes):
         log.info("match: catalogue: %s", text)
     start = start_of(initial, inputs.unit_arcsec)
@@ -65,11 +65,7 @@ def match_lists(inputs: Inputs) -> CampaignMatched:
         refuse_few(remaining.values("epoch"), config.time())
     table = _table(matches, inputs.log)
     warnings = [
-        *(
-            _doubtful_parity(matches.mirrored, parities, _detector_of(initial))
-            if states_parity
-            else []
-        ),
+        *_doubtful_parity(matches.mirrored, parities, document, _detector_of(initial)),
         *matches.warnings(inputs.log),
         *input_warnings(inputs),
         # roll angles of the matches, because the log need not have them
@@ -146,9 +142,14 @@ def _detector_of(calibration: Calibration) -> str:
     return "/".join(parts) or calibration.name
 
 
-def _doubtful_parity(mirrored: bool, parities: tuple[bool, ...], detector: str) -> list[str]:
-    """Warning, as a clause, if the parity of the stars contradicts the initial distortion."""
-    if mirrored == parities[0]:
+def _doubtful_parity(
+    mirrored: bool, parities: tuple[bool, ...], initial: Document, detector: str
+) -> list[str]:
+    """Warning, as a clause, if the parity of the stars contradicts the initial distortion.
+
+    Most formats state no parity, which cannot be contradicted.
+    """
+    if mirrored == parities[0] or initial.mirrored() is None:
         return []
     return [
         f"the stars lie mirrored against what the detector of the known distortion, {detector}, "
