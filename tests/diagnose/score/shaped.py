@@ -15,7 +15,10 @@ from tests.infer.patterned import mode_of
 SIDE = 2048.0
 CHIP = Chip(1, "A", (SIDE, SIDE), (SIDE / 2, SIDE / 2))
 SIGMA = 0.02  # px
-SHAPE = ("skewness by position", "skewness of a patch", "correlation by position", "two cores")
+SHAPE = (
+    *("skewness by position", "skewness of a patch", "correlation by position", "two cores"),
+    "shape by position",
+)
 
 Noise = Callable[[np.random.Generator, int], np.ndarray]
 

@@ -57,6 +57,14 @@ def test_displaced_stars_are_found(name):
     assert found[test].group == "shape" and "without a label" in found[test].remedy
 
 
+def test_two_tests_together_find_what_each_alone_would_miss():
+    """Visits that differ by 2.5 errors, in so few stars that half of the cases are found."""
+    displaced = two_visits(0.05, lambda X: 0.5 + 0.4 * X)
+    found = [examined(scene(np.random.default_rng([12, k]), 1200, displaced)) for k in range(20)]
+    alone = sum(one[SHAPE[0]].significant or one[SHAPE[2]].significant for one in found)
+    assert sum(one[SHAPE[4]].significant for one in found) >= alone + 2
+
+
 def test_a_halo_of_false_matches_is_found_where_it_is():
     rng = np.random.default_rng(4)
     found = examined(scene(rng, 5000, halo(0.4)))["skewness of a patch"]
