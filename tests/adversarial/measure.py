@@ -7,6 +7,7 @@ import os
 import time
 from collections.abc import Iterable
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -122,9 +123,15 @@ def without_motion(error: np.ndarray, at: np.ndarray) -> np.ndarray:
     return (both - taken).reshape(2, -1).T
 
 
-def stated_sigma(results: Results) -> np.ndarray:
-    """Standard deviations (ny * nx, 2) of all terms of the budget together, over the same grid."""
+def stated_sigma(results: Results, *, kindest: bool = False) -> np.ndarray:
+    """Standard deviations (ny * nx, 2) of all terms of the budget together, over the same grid.
+
+    With `kindest` they are those of an observer who fits shift and rotation, as the actual errors
+    of `actual_error` then are.
+    """
     errors, settings = results.errors, results.settings
+    if kindest:
+        errors = replace(errors, aligned=True)
     rng = restarted(assessment_rng(results.config))
     total = errors.at(settings.domain(errors), n=settings.draws, rng=rng).total
     return np.column_stack([total.u, total.v])
@@ -153,7 +160,7 @@ def compared(
         error = campaign_measure.actual_error(results, truth)
         return error, campaign_measure.stated_sigma(results), len(results.data.stars)
     error = actual_error(results, truth, rng, kindest=kindest)[None]
-    return error, stated_sigma(results), truth.stars["x"].size
+    return error, stated_sigma(results, kindest=kindest), truth.stars["x"].size
 
 
 def attainable(margin: Margin, factor: float) -> float:

@@ -212,7 +212,8 @@ def _bending(
     if seed is None:
         return out
     # an exposure has the same deviation on all chips and at all epochs
-    return out + linear.of_single_exposures(mean, chip, np.random.default_rng(seed))[rows]
+    single = linear.of_single_exposures(mean, chip, np.random.default_rng(seed), epoch)
+    return out + single[rows]
 
 
 def _moved(discrepancy: Discrepancy, shift: Float, frames: bool) -> Float:

@@ -67,6 +67,38 @@ NEGLIGIBLE = 1e-3  # density relative to the maximum
 
 
 @dataclass(frozen=True, eq=False)
+class DeviationsInTime:
+    """Draws of the deviations of exposures, of which some have deviations correlated in time."""
+
+    epoch: Float  # (E,) dates of the exposures, decimal years
+    coefficients: Float  # (n, E, q) of the exposures, in the order of the kinds
+    time: Float  # (n,) correlation time of each draw in years; 0 for independent exposures
+
+    def at(self, epoch: float) -> tuple[Float, Float]:
+        """Conditional distribution of the deviations of an exposure at another date.
+
+        Returns
+        -------
+        mean : ndarray, shape (n, q)
+            Expected deviations, given those of the exposures.
+        width : ndarray, shape (n,)
+            Standard deviation about the mean, relative to the scatter of the exposures.
+        """
+        mean = np.zeros(self.coefficients[:, 0].shape)
+        width = np.ones(len(self.time))
+        everywhere = np.ones(len(self.epoch), bool)
+        for time in np.unique(self.time[self.time > 0]):
+            rows = np.flatnonzero(self.time == time)
+            root = correlation_root(self.epoch, float(time), everywhere)
+            correlation = np.exp(-np.abs(self.epoch - epoch) / time)
+            white = scipy.linalg.solve_triangular(root, correlation, lower=True)
+            weight = scipy.linalg.solve_triangular(root, white, trans=1, lower=True)
+            mean[rows] = np.einsum("neq,e->nq", self.coefficients[rows], weight)
+            width[rows] = np.sqrt(max(1.0 - white @ white, 0.0))
+        return mean, width
+
+
+@dataclass(frozen=True, eq=False)
 class LinearDeviations:
     """Draws of the deviations of exposures, and of the curvature of the drift."""
 
@@ -90,6 +122,8 @@ class LinearDeviations:
     correlation_time: float = 0.0
     # rms of the curvature over detector and dates, minus lines in time, both axes together
     bend: float = 0.0
+    # deviations of the exposures, if they may be correlated in time
+    in_time: DeviationsInTime | None = None
 
     @property
     def facts(self) -> dict[str, object]:
@@ -109,10 +143,13 @@ class LinearDeviations:
                 out[:, axis, term] += 0.5 * self.curvature[:, k] * (epoch - self.epoch) ** 2
         return out
 
-    def of_single_exposures(self, mean: Float, chip: int, rng: np.random.Generator) -> Float:
+    def of_single_exposures(
+        self, mean: Float, chip: int, rng: np.random.Generator, epoch: float | None = None
+    ) -> Float:
         """Coefficients (n, 2, K) on a chip (by number) of the deviation of a future exposure.
 
-        The deviations deform the polynomials of the parameters `mean` (D,).
+        The deviations deform the polynomials of the parameters `mean` (D,).  If those of the
+        exposures are correlated in time, they tell that of an exposure at the date `epoch`.
         """
         code, n = self.model.chip_code(chip), len(self.theta)
         at = np.array([self.model.time.epoch0[0] if self.model.time else 0.0])
@@ -120,12 +157,20 @@ class LinearDeviations:
         P[:, 0] = 0.0
         along = np.zeros((2, *P.shape))
         along[0, 0, 0] = along[1, 1, 0] = self.size
+        fields = [
+            (kind, field)
+            for kind in self.kinds
+            for field in (
+                along if kind == "shift" else [LINEAR_MATRICES[k] @ P for k in LINEAR[kind]]
+            )
+        ]
+        expected, width = np.zeros((n, len(fields))), np.ones(n)
+        if self.in_time is not None and epoch is not None:
+            expected, width = self.in_time.at(epoch)
         out = np.zeros((n, *P.shape))
-        for kind in self.kinds:
-            fields = along if kind == "shift" else [LINEAR_MATRICES[k] @ P for k in LINEAR[kind]]
-            for field in fields:
-                size = self.scatter[SCATTERS[kind]] * rng.standard_normal(n)
-                out += size[:, None, None] * field
+        for k, (kind, field) in enumerate(fields):
+            size = expected[:, k] + width * self.scatter[SCATTERS[kind]] * rng.standard_normal(n)
+            out += size[:, None, None] * field
         return out
 
 
@@ -372,7 +417,15 @@ def deviation_draws(
     coefficients, amplitudes = np.concatenate(drawn)[order], np.concatenate(sizes)[order]
     of_fit = np.concatenate(followed)[order]
     per = columns.n_of_exposures // max(columns.n_exposures, 1)
-    wrong = loose[: columns.n_of_exposures].reshape(columns.n_exposures, -1).any(axis=1)
+    wrong: Bool = loose[: columns.n_of_exposures].reshape(columns.n_exposures, -1).any(axis=1)
+    correlation_time = np.concatenate(times)[order]
+    in_time = None
+    if correlation_time.any() and columns.n_exposures == columns.n_all:
+        by_exposure = coefficients[:, : columns.n_of_exposures].reshape(n, columns.n_exposures, -1)
+        typical = np.logical_not(wrong)
+        in_time = DeviationsInTime(
+            columns.epoch[typical], by_exposure[:, typical], correlation_time
+        )
     return LinearDeviations(
         model=columns.model,
         # the fit absorbs a deviation, so that its error has the opposite sign
@@ -385,8 +438,9 @@ def deviation_draws(
         kinds=columns.kinds,
         size=columns.size,
         outlying=tuple(int(code) for code in columns.code[wrong]) if per else (),
-        correlation_time=float(np.median(np.concatenate(times))),
+        correlation_time=float(np.median(correlation_time)),
         bend=_bend(columns, curvature),
+        in_time=in_time,
     )
 
 

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from bayesdist.diagnose.correlated import deviations, estimate_discrepancy
+from bayesdist.diagnose.correlated.deviations import DeviationsInTime
 from bayesdist.infer import Rejection, build_model, fit_linear
+from bayesdist.model import TimeDependence
 from tests.diagnose.correlated.skies import SIZE, matched
 from tests.reduced import case_in_full, only_in_full
 
@@ -108,3 +110,57 @@ def test_a_single_exposure_deviates_in_what_its_frame_does_not_fit(frames, kinds
     assert (np.std(a + d) > 1e-7 * size) == ("scale" in kinds)
     assert (np.abs(P[:, :, constant]).max() > 0) == ("shift" in kinds)
     assert np.std(a - d) > 1e-7 * size and np.std(b + c) > 1e-7 * size
+
+
+def test_deviations_at_another_date_are_those_of_the_joint_distribution():
+    """Mean and variance follow from the precision matrix of all dates together."""
+    rng = np.random.default_rng(5)
+    epoch, time = np.sort(rng.uniform(2000, 2010, 9)), np.array([0.0, 3.0, 8.0])
+    found = DeviationsInTime(epoch, rng.standard_normal((3, 9, 2)), time)
+    for at in (1999.0, 2004.2, 2011.5):
+        mean, width = found.at(at)
+        assert mean[0] == pytest.approx(0.0) and width[0] == 1.0
+        dates = np.append(epoch, at)
+        for k in (1, 2):
+            precision = np.linalg.inv(np.exp(-np.abs(np.subtract.outer(dates, dates)) / time[k]))
+            expected = -precision[-1, :-1] @ found.coefficients[k] / precision[-1, -1]
+            np.testing.assert_allclose(mean[k], expected, atol=1e-3)
+            assert width[k] == pytest.approx(1 / np.sqrt(precision[-1, -1]), abs=1e-3)
+
+
+def test_an_exposure_deviates_as_those_of_its_date():
+    """Scales that wander off from a line in time, seen at the date of the last exposure."""
+    rng, exposures, n = np.random.default_rng(6), 30, 80
+    _, table, true = matched(n * exposures, rng)
+    code, dates = np.arange(n * exposures) % exposures, np.linspace(2000, 2010, exposures)
+    factor = 1 + 5 * SCATTER * np.cumsum(rng.standard_normal((exposures, 2)), axis=0)
+    table = replace(
+        table,
+        u=factor[code, 0] * table.u,
+        v=factor[code, 1] * table.v,
+        exposure=code,
+        exposure_names=tuple(f"e{k:02d}" for k in range(exposures)),
+        epoch=dates[code],
+    )
+    drift = TimeDependence((("u", 1, 0), ("v", 0, 1)), (2005.0,))
+    model = build_model(table, order=3, size=(SIZE, SIZE), frames="shift_rotation", time=drift)
+    fit = fit_linear(table, model, rejection=Rejection(1e9, 1e9))
+    found = estimate_discrepancy(table, fit, rng=rng, stars=table)
+    linear = found.linear
+    assert linear is not None and linear.in_time is not None
+    x, y = SIZE * np.array([0.9, 0.1]), SIZE * np.array([0.8, 0.2])
+    phi = model.basis(1).evaluate(x, y)[0] - model.basis(1).evaluate(x, y)[1]
+    at = np.zeros(1, int), dates[-1:]
+    predicted = model.polynomials(found.mean, *at)[0]
+    actual = factor[-1] * (true(x, y)[0] - true(x, y)[1]) - predicted @ phi
+    moved = np.array([model.polynomials(found.mean + t, *at)[0] for t in linear.theta]) - predicted
+    moved += linear.polynomials(dates[-1], 1)
+    spread = {}
+    for date in (None, dates[-1]):
+        single = linear.of_single_exposures(found.mean, 1, np.random.default_rng(1), date)
+        error = (moved + single) @ phi
+        spread[date] = error.std(axis=0)
+    # the residuals of the last exposure are known, whatever else is not
+    assert (np.abs(actual) > 3 * spread[dates[-1]]).any()
+    assert (np.abs(error.mean(axis=0) - actual) < 3 * spread[dates[-1]]).all()
+    assert (spread[dates[-1]] < 0.3 * spread[None]).all()
