@@ -61,7 +61,7 @@ CORRELATION = replace(
 BOTH = replace(
     SKEWNESS,
     name="shape by position",
-    present="the residuals are lopsided, and correlated along both axes, differently over the field",
+    present="the residuals are lopsided and correlated along both axes, differently over the field",
     absent="skewness and correlation together do not differ over the field",
 )
 TWO_CORES = replace(
