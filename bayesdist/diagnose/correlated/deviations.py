@@ -417,12 +417,12 @@ def deviation_draws(
     coefficients, amplitudes = np.concatenate(drawn)[order], np.concatenate(sizes)[order]
     of_fit = np.concatenate(followed)[order]
     per = columns.n_of_exposures // max(columns.n_exposures, 1)
-    wrong: Bool = loose[: columns.n_of_exposures].reshape(columns.n_exposures, -1).any(axis=1)
+    wrong = loose[: columns.n_of_exposures].reshape(columns.n_exposures, -1).any(axis=1)
     correlation_time = np.concatenate(times)[order]
     in_time = None
     if correlation_time.any() and columns.n_exposures == columns.n_all:
         by_exposure = coefficients[:, : columns.n_of_exposures].reshape(n, columns.n_exposures, -1)
-        typical = np.logical_not(wrong)
+        typical = np.flatnonzero(np.logical_not(wrong))
         in_time = DeviationsInTime(
             columns.epoch[typical], by_exposure[:, typical], correlation_time
         )
