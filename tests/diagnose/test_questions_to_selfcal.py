@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -14,6 +16,7 @@ from bayesdist.infer.selfcal.mode import SelfCalibrationMode, gauge_of, solve
 from bayesdist.infer.selfcal.problem import prepare
 from tests.infer.selfcal.fields import field
 
+from .score.shaped import SHAPE
 from .support import by_name
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -21,7 +24,10 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 @pytest.fixture(scope="module")
 def solution() -> SelfCalibrationMode:
-    simulated = field(20, 8, 500, n_chips=2, order=2)
+    return solution_of(field(20, 8, 500, n_chips=2, order=2))
+
+
+def solution_of(simulated) -> SelfCalibrationMode:
     theta = simulated.theta
     problem = prepare(simulated.model, simulated.detections, theta, match_radius=1.0)
     prior = Prior.none(theta)
@@ -40,12 +46,33 @@ def known(solution) -> dict[str, np.ndarray]:
 def test_every_question_has_a_row_where_the_data_can_be_asked(solution):
     found = by_name(selfcal_score_tests(solution, **known(solution)))
     always = {"order 3", "order 4", "pointing", "exposures", "noise by position"}
-    always |= {"noise by exposure", "noise by axis"}
+    always |= {"noise by exposure", "noise by axis", "second order of exposures", *SHAPE}
     # bins of magnitude need more stars
     assert set(found) - {"noise by magnitude"} == always | {"magnitude", "motions"}
     assert set(by_name(selfcal_score_tests(solution))) == always
     # the model of a self-calibration has no magnitude terms
     assert found["magnitude"].remedy.startswith("cut the faint stars")
+
+
+def test_displaced_detections_and_exposures_of_second_order_are_told_apart():
+    """Both resemble a curved sky and noise that depends on position; other remedies help."""
+    simulated, rng = field(21, 12, 1000), np.random.default_rng(2)
+    d = simulated.detections
+    X, Y = d.x / 512 - 1, d.y / 512 - 1
+    tailed = (rng.uniform(size=len(X)) < 0.3 * (1 + X)) * rng.exponential(0.1, len(X))
+    bent = 0.05 * (-1.0) ** d.exposure * X * Y
+    found = {}
+    for name, dx in (("tail", tailed), ("bent", bent)):
+        moved = replace(simulated, detections=replace(d, x=d.x + dx))
+        found[name] = by_name(selfcal_score_tests(solution_of(moved)))
+    tail, bent = found["tail"], found["bent"]
+    assert tail["skewness by position"].significant
+    assert "cut the detections" in tail["skewness by position"].remedy
+    assert not tail["second order of exposures"].significant
+    assert bent["second order of exposures"].p_value < 1e-9
+    assert not any(bent[test].significant for test in SHAPE)
+    for test in bent.values():
+        assert not test.significant or "scale_mas" not in test.remedy, test.name
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.7])

@@ -39,13 +39,23 @@ KINDS = {
     "scale": ("shift_rotation_scale", "affine"),
     "shear": ("affine",),
 }
-# parameters of these deviations, except for shifts
+# deviations that are not linear; they are only tested
+SECOND_ORDER = "second order"
+# parameters of linear deviations, except for shifts
 LINEAR = {
     "rotation": ("rotation",),
     "scale": ("scale",),
     "shear": ("shear_plus", "shear_cross"),
 }
-SCATTERS = {"shift": "shift", "rotation": "rotation", "scale": "shape", "shear": "shape"}
+# number of coefficients of each kind
+COEFFICIENTS = {"shift": 2, SECOND_ORDER: 6} | {kind: len(names) for kind, names in LINEAR.items()}
+SCATTERS = {
+    "shift": "shift",
+    "rotation": "rotation",
+    "scale": "shape",
+    "shear": "shape",
+    SECOND_ORDER: SECOND_ORDER,
+}
 CURVATURE = "curvature"
 # largest number of estimated deviations of exposures (6 of each exposure without frames, 3 if shift
 # and rotation are fitted); if there are more, those of a subset of the exposures represent all
@@ -234,13 +244,15 @@ def deviation_columns(
     counts: Float,
     *,
     exposures: bool = True,
+    second_order: bool = False,
     most: int | None = None,
 ) -> DeviationColumns | None:
     """Deviations that the frames of a model do not include, and curvatures of its drift.
 
     `counts` (G,) is the number of stars of each group.  Without `exposures`, single exposures do
-    not deviate; this is the case if a hierarchy of them was fitted.  Returns None if nothing can
-    deviate, for example for a single exposure without a drift.
+    not deviate; this is the case if a hierarchy of them was fitted.  With `second_order` they
+    deviate in terms of the second order as well.  Returns None if nothing can deviate, for example
+    for a single exposure without a drift.
 
     The deviations of at most `most` exposures are estimated; by default as many as have
     `MAX_DEVIATIONS` deviations.  If there are more exposures, the selected ones represent all and
@@ -251,10 +263,12 @@ def deviation_columns(
     distinct, of_group = np.unique(keys, axis=0, return_inverse=True)
     n_all = n_exposures = len(distinct)
     kinds = tuple(k for k, fitted in KINDS.items() if model.frames not in fitted)
+    if second_order:
+        kinds = (*kinds, SECOND_ORDER)
     if n_all < 2 or not exposures:
         kinds = ()
     chosen = np.arange(n_all)
-    per_exposure = [SCATTERS[k] for k in kinds for _ in LINEAR.get(k, "uv")]
+    per_exposure = [SCATTERS[k] for k in kinds for _ in range(COEFFICIENTS[k])]
     if most is None:
         most = MAX_DEVIATIONS // max(len(per_exposure), 1)
     if kinds and n_all > most:
@@ -607,11 +621,18 @@ def _bending(model: DistortionModel) -> tuple[tuple[int, int, int], ...]:
 
 
 def _deviations(position: Float, kinds: Sequence[str], size: float) -> Float:
-    """Displacements (C, 2, q) due to unit deviations of each kind; shifts are in half sides."""
+    """Displacements (C, 2, q) due to unit deviations of each kind.
+
+    Shifts, and the largest displacements of the second order, are in half sides of a chip.
+    """
     chosen = [np.zeros((len(position), 0, 2))]
     for kind in kinds:
         if kind == "shift":
             chosen.append(np.broadcast_to(size * np.eye(2), (len(position), 2, 2)))
+        elif kind == SECOND_ORDER:
+            X, Y = position.T / size
+            terms = size * np.stack([X**2, X * Y, Y**2], axis=1)
+            chosen.append(np.einsum("ck,ab->cakb", terms, np.eye(2)).reshape(len(position), 6, 2))
         else:
             matrices = np.stack([LINEAR_MATRICES[name] for name in LINEAR[kind]])
             chosen.append(np.einsum("kab,cb->cka", matrices, position))

@@ -20,7 +20,7 @@ from scipy import special
 
 from bayesdist.diagnose.statistics import holm
 from bayesdist.utils.checks import LARGER
-from bayesdist.utils.distributions import chi2_isf, f_isf, f_sf
+from bayesdist.utils.distributions import chi2_isf, chi2_sf, f_isf, f_sf
 from bayesdist.utils.limits import SCORE_TESTS
 from bayesdist.utils.numbers import p_words
 
@@ -32,6 +32,7 @@ MISSING_ORDERS = "missing orders"  # name of the test for all further orders
 POWER = 0.9  # probability of detecting an effect of the stated smallest size
 # p-value below which a few of many functions are regarded as the common cause
 LEADING_CHANCE = 0.01
+LEAST_LEFT = 0.1  # of what a few functions explain: less than that is left by their inaccuracy
 OF_FIELD = ("orders", "edges", "jumps", "rings", "repeating pattern")
 # polynomials of missing orders resemble these, and follow them in part
 STEEP = ("jumps", "rings", "repeating pattern")
@@ -233,6 +234,8 @@ def _causes(significant: Mapping[str, Family], outcomes: Sequence[Outcome]) -> d
         if name in significant
         and not all(explains_more(by_name[name], result) for result in competitors)
     }
+    if any(leaves_much(by_name["pointing"], result) for result in single if "pointing" in by_name):
+        weaker.add("pointing")
     # Terms of a missing order contain steps and rings that are smaller than the terms themselves,
     # whereas polynomials follow a true step or ring only in part.
     # The robust fit includes the next orders.
@@ -377,3 +380,25 @@ def explains_more(one: tuple[float, float], other: tuple[float, float]) -> bool:
     """
     ratio = (one[0] / one[1]) / (other[0] / other[1])
     return bool(f_sf(ratio, one[1], other[1]) < LEADING_CHANCE)
+
+
+def leaves_much(one: tuple[float, float], other: tuple[float, float]) -> bool:
+    """True if many functions explain much that a few of their combinations do not.
+
+    A curved sky deforms exposures by their pointing alone: what their own terms explain beyond that
+    is noise.  The pointing explains a part of terms that differ at random, by chance.
+
+    Parameters
+    ----------
+    one, other : tuple of float
+        Statistic and degrees of freedom of the few functions, and of the many.
+
+    Returns
+    -------
+    bool
+    """
+    left, dof = other[0] - one[0], other[1] - one[1]
+    if dof <= 0:
+        return False
+    by_chance = chi2_sf(max(left, 0.0), dof)
+    return bool(by_chance < LEADING_CHANCE and left - dof > LEAST_LEFT * (one[0] - one[1]))

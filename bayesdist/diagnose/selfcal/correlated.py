@@ -72,7 +72,7 @@ def selfcal_discrepancy(
 
     star_subset = EvenStars.of(solution)
     flat, working = flat.at(star_subset.rows), working.at(star_subset.rows)
-    functions, deviations = _functions(star_subset.problem), star_subset.deviations
+    functions, deviations = _functions(star_subset.problem), star_subset.deviating()
     columns = AddedColumns(star_subset.problem, solution.theta, functions, deviations)
     N, score, response = eliminated(columns, flat, star_subset.stars, working=working)
     efficient = without_parameters(solution, N, score)

@@ -46,6 +46,7 @@ from bayesdist.utils.arrays import Bool, Float, Int
 DETECTIONS = 8192  # per chunk in memory
 MAX_DETECTIONS = 60_000  # largest number that is examined
 MAX_EXPOSURES = 150  # largest number of exposures with separate deviations
+MAX_EXPOSURES_OF_SECOND_ORDER = 80
 # relative curvature below which a combination of parameters, or of a star's parameters, counts as
 # undetermined
 UNKNOWN = 1e-10
@@ -144,20 +145,31 @@ class EvenStars:
     rows: Bool  # (N,) mask of their detections among those of all stars
     problem: Problem
     stars: Float  # (S, q)
-    deviations: DeviationColumns | None  # deviations of their exposures
+    theta: Float  # (D,) parameters of the solution
 
     @classmethod
     def of(cls, solution: SelfCalibrationMode) -> EvenStars:
         """Select every k-th star, such that there are at most `MAX_DETECTIONS` detections."""
         all_stars = solution.problem
         selected = np.arange(0, all_stars.n_stars, int(np.ceil(len(all_stars) / MAX_DETECTIONS)))
-        problem = all_stars.of_stars(selected)
-        groups = problem.groups
-        counts = np.bincount(groups.index, minlength=len(groups)).astype(float)
-        deviations = deviation_columns(
-            all_stars.model, solution.theta, groups, counts, most=MAX_EXPOSURES
+        return cls(
+            np.isin(all_stars.star, selected),
+            all_stars.of_stars(selected),
+            solution.stars[selected],
+            solution.theta,
         )
-        return cls(np.isin(all_stars.star, selected), problem, solution.stars[selected], deviations)
+
+    def deviating(self, *, second_order: bool = False) -> DeviationColumns | None:
+        """Deviations of their exposures, on request with terms of the second order."""
+        groups = self.problem.groups
+        return deviation_columns(
+            self.problem.model,
+            self.theta,
+            groups,
+            np.bincount(groups.index, minlength=len(groups)).astype(float),
+            second_order=second_order,
+            most=MAX_EXPOSURES_OF_SECOND_ORDER if second_order else MAX_EXPOSURES,
+        )
 
 
 @dataclass(frozen=True, eq=False)

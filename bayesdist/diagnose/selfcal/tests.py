@@ -1,11 +1,9 @@
 """Tests of the residuals of self-calibrations, with the stars eliminated.
 
-Score tests of self-calibrations: what a model lacks, with the stars eliminated.
-
-The questions are those for matched stars (`diagnose.score.questions`).  The positions of stars are
-among the parameters that are projected out, and the scores of a star's detections are summed.
-Effects that the stars absorb cannot be tested: directions that would be far better determined if
-the stars were known are left out.
+The questions of the score tests are those for matched stars (`diagnose.score.questions`).  The
+positions of stars are among the parameters that are projected out, and the scores of a star's
+detections are summed. Effects that the stars absorb cannot be tested: directions that would be far
+better determined if the stars were known are left out.
 
 Does the model describe the detections if the positions of stars are fitted with it?
 
@@ -28,8 +26,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.sparse import csr_array
 
+from bayesdist.diagnose.correlated.deviations import SECOND_ORDER as SECOND_ORDER_KIND
 from bayesdist.diagnose.residuals.misfit import Misfit, bin_means, partitions_for, worst_misfit
-from bayesdist.diagnose.score.exposures import EXPOSURES
+from bayesdist.diagnose.score.exposures import EXPOSURES, SECOND_ORDER
+from bayesdist.diagnose.score.missing_orders import chip_residuals
 from bayesdist.diagnose.score.motions import MIN_MOTION_SPAN, MOTIONS, StarResiduals, motion_outcome
 from bayesdist.diagnose.score.noise import noise_tests
 from bayesdist.diagnose.score.questions import (
@@ -40,6 +40,7 @@ from bayesdist.diagnose.score.questions import (
 )
 from bayesdist.diagnose.score.result import Family, Outcome, ScoreTest, corrected, outcome
 from bayesdist.diagnose.score.sample import ScoredSample
+from bayesdist.diagnose.score.shape import shape_tests
 from bayesdist.diagnose.selfcal.eliminated import (
     AddedColumns,
     EvenStars,
@@ -74,6 +75,10 @@ MOTIONS_OF_SELFCAL = replace(
     remedy="set selfcal.motion to 'proper_motion'",
     present="stars move between the dates of the exposures, and are taken to stand still",
 )
+DISPLACED = (
+    "blends, ghosts, charge-transfer tails or trailed exposures make such residuals: cut the "
+    "detections that are displaced; a higher order or larger errors do not help"
+)
 MAX_SIDE = 16  # cells along each side of a chip
 MAX_CELLS = 512  # of all chips together, because the matrix of all shifts is decomposed
 MIN_STAR_INFORMATION = 0.05  # of a direction, relative to that for known stars
@@ -99,11 +104,14 @@ class _AddedColumns(AddedColumns):
         first = functions - self.problem.model.n_terms
         return np.ravel(2 * n * chips[:, None, None] + first[:, None] + [0, n])
 
-    @property
-    def of_exposures(self) -> Int:
-        """Columns of the deviations of exposures."""
-        n = 0 if self.deviations is None else self.deviations.n_of_exposures
-        return 2 * self.n_functions(0) * len(self.problem.model.chips) + np.arange(n)
+    def of_exposures(self, *, second_order: bool) -> Int:
+        """Columns of the linear deviations of exposures, or of those of the second order."""
+        if self.deviations is None:
+            return np.zeros(0, int)
+        n = self.deviations.n_of_exposures
+        chosen = (self.deviations.scatter[:n] == SECOND_ORDER_KIND) == second_order
+        first = 2 * self.n_functions(0) * len(self.problem.model.chips)
+        return first + np.flatnonzero(chosen)
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,23 +159,35 @@ def selfcal_score_tests(
     sample = _sample(solution, star_subset, chosen, mag=mag, colour=colour, epoch=epoch)
     functions = functions_for(sample)
     columns = _AddedColumns(
-        star_subset.problem, solution.theta, deviations=star_subset.deviations, added=functions
+        star_subset.problem,
+        solution.theta,
+        deviations=star_subset.deviating(second_order=True),
+        added=functions,
     )
     sums = _summed(solution, columns, chosen, star_subset.stars)
     outcomes = one_of_each(_regressor_tests(sums, columns, functions))
-    of_exposures = columns.of_exposures
-    all_columns = np.ones(len(of_exposures), bool)
-    deviating = _tested(
-        sums, EXPOSURES_OF_SELFCAL, of_exposures, all_columns, np.eye(len(of_exposures))
-    )
+    deviating = [
+        _tested(sums, family, which, np.ones(len(which), bool), np.eye(len(which)))
+        for family, which in (
+            (EXPOSURES_OF_SELFCAL, columns.of_exposures(second_order=False)),
+            (SECOND_ORDER, columns.of_exposures(second_order=True)),
+        )
+    ]
     moving = None
     if epoch is not None and problem.n_star == 2 and np.ptp(epoch) > MIN_MOTION_SPAN:
         stars = StarResiduals(
             problem.star, epoch, scores.gradient, scores.curvature, problem.priors.precision
         )
         moving = motion_outcome(stars, problem.model.unit, MOTIONS_OF_SELFCAL)
-    outcomes += [outcome for outcome in (deviating, moving) if outcome is not None]
-    return corrected([*outcomes, *noise_tests(sample)])
+    outcomes += [outcome for outcome in (*deviating, moving) if outcome is not None]
+    return corrected([*_shapes(sample), *outcomes, *noise_tests(sample)])
+
+
+def _shapes(sample: ScoredSample) -> list[Outcome]:
+    """Outcomes of the tests of the shape of the residuals, which are along the detector axes."""
+    sample = replace(sample, turn=np.broadcast_to(np.eye(2), sample.turn.shape))
+    outcomes = shape_tests(sample, chip_residuals(sample))
+    return [replace(one, family=replace(one.family, remedy=DISPLACED)) for one in outcomes]
 
 
 def _summed(
