@@ -32,7 +32,7 @@ MISSING_ORDERS = "missing orders"  # name of the test for all further orders
 POWER = 0.9  # probability of detecting an effect of the stated smallest size
 # p-value below which a few of many functions are regarded as the common cause
 LEADING_CHANCE = 0.01
-LEAST_LEFT = 0.1  # of what a few functions explain: less than that is left by their inaccuracy
+LEAST_LEFT = 0.2  # of what a few functions explain: less than that is left by their inaccuracy
 OF_FIELD = ("orders", "edges", "jumps", "rings", "repeating pattern")
 # polynomials of missing orders resemble these, and follow them in part
 STEEP = ("jumps", "rings", "repeating pattern")
