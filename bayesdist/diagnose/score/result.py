@@ -36,6 +36,7 @@ LEAST_LEFT = 0.2  # of what a few functions explain: less than that is left by t
 OF_FIELD = ("orders", "edges", "jumps", "rings", "repeating pattern")
 # polynomials of missing orders resemble these, and follow them in part
 STEEP = ("jumps", "rings", "repeating pattern")
+SKEWED = ("skewness by position", "skewness of a patch")
 OF_NOISE = ("noise by position", "noise by axis")
 OF_EXPOSURES = ("noise by exposure", *OF_NOISE)
 
@@ -249,6 +250,10 @@ def _causes(significant: Mapping[str, Family], outcomes: Sequence[Outcome]) -> d
         if result.name in STEEP and result.name in significant and result.size**2 > orders_square
     }
     weaker |= set(STEEP) - {max(steep, key=steep.__getitem__, default="")}
+    # Structure of the size of the errors correlates the residuals and gives them two cores, as
+    # displaced stars do, but they are not lopsided.
+    if steep and not set(SKEWED) & set(significant):
+        weaker |= {name for name, family in significant.items() if family.group == "shape"}
     return {name: family for name, family in significant.items() if name not in weaker}
 
 
@@ -322,9 +327,15 @@ CAUSES: dict[str, Cause] = {
         "fields that differ between exposures", ("pointing", *OF_EXPOSURES)
     ),
     # causes only if larger than missing orders, and the most significant one of them
-    "jumps": Cause("the jump", ("orders", "edges", "rings", "repeating pattern", *OF_NOISE)),
-    "repeating pattern": Cause("the pattern", ("orders", "edges", "jumps", "rings", *OF_NOISE)),
-    "rings": Cause("the rings", ("orders", "edges", "jumps", "repeating pattern", *OF_NOISE)),
+    "jumps": Cause(
+        "the jump", ("orders", "edges", "rings", "repeating pattern", "shape", *OF_NOISE)
+    ),
+    "repeating pattern": Cause(
+        "the pattern", ("orders", "edges", "jumps", "rings", "shape", *OF_NOISE)
+    ),
+    "rings": Cause(
+        "the rings", ("orders", "edges", "jumps", "repeating pattern", "shape", *OF_NOISE)
+    ),
     # a cause only if it explains more than missing orders do
     "edges": Cause(
         "what rises towards the edges", ("orders", "jumps", "repeating pattern", *OF_NOISE)

@@ -141,6 +141,22 @@ def test_what_the_model_lacks_is_not_taken_for_a_shape(order):
     assert min(found[test].p_value for test in SHAPE) > 1e-3
 
 
+@pytest.mark.parametrize("size", [1.0, 2.0])
+def test_rings_of_the_size_of_the_errors_are_no_displaced_stars(size):
+    """They have two cores and correlate the residuals, which are not lopsided."""
+
+    def rings(rng, x, y):
+        away = np.stack([x, y], axis=1) - rng.uniform(-500, 2500, 2)
+        r = np.hypot(*away.T)[:, None]
+        wave = np.cos(2 * np.pi * r / rng.uniform(150, 400))
+        return size * SIGMA * np.sqrt(2) * wave * away / r
+
+    found = examined(scene(np.random.default_rng(13), 3000, rings))
+    assert found[SHAPE[2]].significant and not found[SHAPE[0]].significant
+    remedies = {test.remedy for test in found.values() if test.significant}
+    assert len(remedies) == 1 and "without a label" not in remedies.pop()
+
+
 def test_a_star_counts_once():
     """Rows that stand three times with the code of their star say no more than once."""
     rng = np.random.default_rng(8)
