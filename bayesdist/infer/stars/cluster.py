@@ -521,10 +521,14 @@ def _without_messages(client: Any) -> Iterator[None]:
 
     Whatever ends a run is an exception with a message of its own.
     """
-    # of tasks that nobody awaits any more
-    client.loop.asyncio_loop.set_exception_handler(_ignore)
-    with silence_logging_cmgr(logging.CRITICAL):
-        yield
+    loop = client.loop.asyncio_loop
+    handler = loop.get_exception_handler()
+    loop.set_exception_handler(_ignore)  # of tasks that nobody awaits any more
+    try:
+        with silence_logging_cmgr(logging.CRITICAL):
+            yield
+    finally:
+        loop.set_exception_handler(handler)
 
 
 def _ignore(*_: object) -> None:

@@ -1,12 +1,17 @@
-"""A scheduler that is killed during a run: one sentence, soon, and no traceback."""
+"""Messages of a lost scheduler: one sentence, soon, no traceback, and not those of others."""
 
 from __future__ import annotations
 
+import asyncio
 import subprocess
 import sys
 import time
+from contextlib import closing
+from types import SimpleNamespace
 
 import pytest
+
+from bayesdist.infer.stars.cluster import _without_messages
 
 CLUSTER = """
 import sys
@@ -68,3 +73,14 @@ def test_the_scheduler_is_killed_during_a_pass():
         f"cluster {address}: the connection to the scheduler is lost; start it and the run again.\n"
     )
     assert (client.returncode, err) == (0, "")
+
+
+def test_the_handler_of_the_event_loop_is_restored():
+    """The loop belongs to the client, which other code of the program may use as well."""
+    told = []
+    with closing(asyncio.new_event_loop()) as loop:
+        loop.set_exception_handler(lambda _, context: told.append(context["message"]))
+        with _without_messages(SimpleNamespace(loop=SimpleNamespace(asyncio_loop=loop))):
+            loop.call_exception_handler({"message": "during the run"})
+        loop.call_exception_handler({"message": "after it"})
+    assert told == ["after it"]
