@@ -80,7 +80,7 @@ def _uncompressed(raw: bytes, budget: Budget) -> bytes:
     parts, total = [raw[: tree_end.end()]], 0
     for flags, data in _blocks(raw, raw.find(_MAGIC, tree_end.end()), budget):
         total += len(data)
-        budget.refuse_content(total)
+        budget.refuse_arrays(total)
         sizes = (0,) * 3 if flags & _STREAMED else (len(data),) * 3
         header = _HEADER.pack(flags, bytes(4), *sizes, bytes(16))
         parts += [_MAGIC, struct.pack(">H", len(header)), header, data]
@@ -92,7 +92,7 @@ def _blocks(raw: bytes, at: int, budget: Budget) -> Iterator[tuple[int, bytes]]:
     number, clock = 0, budget.clock()
     while at >= 0 and raw[at : at + 4] == _MAGIC:
         number += 1
-        budget.refuse_parts(number, "blocks")
+        budget.refuse_nodes(number, "blocks")
         begin = at + 6 + int.from_bytes(raw[at + 4 : at + 6])
         if begin - at - 6 < _HEADER.size or begin > len(raw):
             raise _damaged("the header of a block is not whole", budget)
@@ -102,7 +102,7 @@ def _blocks(raw: bytes, at: int, budget: Budget) -> Iterator[tuple[int, bytes]]:
             return
         if begin + used > len(raw):
             raise _damaged("a block ends before its data", budget)
-        budget.refuse_content(size)
+        budget.refuse_arrays(size)
         codec = kind.strip(b"\0").decode("latin-1")
         data = _decompressed(raw[begin : begin + used], codec, size, budget)
         if len(data) != size:
@@ -151,7 +151,7 @@ def _lz4_pieces(raw: bytes, limit: int, budget: Budget) -> Iterator[bytes]:
         (n,) = struct.unpack_from(">I", raw, at)
         (size,) = struct.unpack_from("<I", raw, at + 4)
         total += size
-        budget.refuse_content(total)
+        budget.refuse_arrays(total)
         yield lz4.block.decompress(raw[at + 4 : at + 4 + n])
         at += 4 + n
 
@@ -161,14 +161,14 @@ def _refuse_larger(tree: Any, budget: Budget, max_order: int) -> None:
 
     The strides of an array may be 0, so its shape can exceed the size of its block.
     """
-    nodes, clock, cells = [tree], budget.clock(), 0.0
+    nodes, clock, total = [tree], budget.clock(), 0.0
     while nodes:
         node = nodes.pop()
         clock()
         if isinstance(node, Mapping):
             tag = str(getattr(node, "_tag", ""))
             if "/core/ndarray" in tag or {"source", "shape", "datatype"} <= set(node):
-                cells += _cells(node, budget)
+                total += _array_size(node, budget)
             if isinstance(node.get("$ref"), str) and not node["$ref"].startswith("#"):
                 raise FormatError(
                     "refers to another file", where=budget.where, do="write it with its arrays"
@@ -178,16 +178,29 @@ def _refuse_larger(tree: Any, budget: Budget, max_order: int) -> None:
             nodes += node.values()
         elif isinstance(node, list | tuple):
             nodes += node
-    budget.refuse_cells(cells)
+    budget.refuse_arrays(total)
 
 
-def _cells(node: Mapping[str, Any], budget: Budget) -> float:
-    """Number of elements of an array according to its shape."""
+def _array_size(node: Mapping[str, Any], budget: Budget) -> float:
+    """Size of an array in bytes according to its shape and type."""
     if isinstance(node.get("source"), str):
         raise FormatError(
             "an array lies in another file", where=budget.where, do="write it with its arrays"
         )
-    return math.prod(float(n) for n in _shape(node))
+    return math.prod(float(n) for n in _shape(node)) * _item_size(node.get("datatype"))
+
+
+def _item_size(datatype: Any) -> float:
+    """Size of an element in bytes: of a number, a text ["ucs4", length], or a list of fields."""
+    if isinstance(datatype, Mapping):
+        n = math.prod(float(side) for side in _shape(datatype))
+        return n * _item_size(datatype.get("datatype"))
+    if isinstance(datatype, list) and len(datatype) == 2 and isinstance(datatype[1], int):
+        return float(datatype[1]) * (4 if datatype[0] == "ucs4" else 1)
+    if isinstance(datatype, list):
+        return sum(map(_item_size, datatype))
+    bits = re.search(r"\d+$", str(datatype))
+    return int(bits[0]) / 8 if bits is not None and len(bits[0]) <= 3 else 8
 
 
 def _shape(node: Any) -> list[float]:

@@ -20,8 +20,12 @@ class Limits:
     may have, however small it is, and an amount per byte of the file on disk.
     """
 
-    content: int = 2**25  # bytes after decompression, and bytes of arrays
+    content: int = 2**25  # bytes after decompression, and bytes of columns
     content_per_byte: float = 100  # tables of stars are compressed by a factor below ten
+    # bytes of images and other arrays, whatever the size of the file, because constant ones are
+    # compressed a thousandfold: two planes of 4096 x 4096 pixels in single precision, and headers
+    arrays: int = 2**27 + 2**20
+    held: int = 2**26  # bytes that are kept before it is known whether all will be accepted
     rows: int = 2**17
     rows_per_byte: float = 0.5  # the numbers of one star need at least four bytes
     cells: int = 2**20  # of tables, or numbers in the arrays of a tree
@@ -29,8 +33,8 @@ class Limits:
     seconds: float = 5  # processor time
     seconds_per_byte: float = 5e-6
     columns: int = 10_000  # FITS has at most 999; gbdes has one per parameter
-    parts: int = 1000  # HDUs, or blocks of ASDF
-    nodes: int = 50_000  # of a tree, with aliases counted each time; header cards
+    parts: int = 1000  # HDUs
+    nodes: int = 50_000  # of a tree, with aliases counted each time; header cards; blocks of ASDF
     header: int = 2**20  # characters of a YAML header; a column needs about a hundred
     line: int = 2**18  # characters: ten thousand columns take 250,000
     depth: int = 64  # nesting of groups, elements or brackets; files of bayesdist have ten
@@ -73,13 +77,25 @@ class Budget:
         return int(min(memory_limit(), limit))
 
     @property
+    def arrays(self) -> int:
+        """Largest size in bytes of images and other arrays that are no columns of stars."""
+        return max(self.content, min(memory_limit(), self.limits.arrays))
+
+    @property
     def rows(self) -> int:
         """Largest number of rows of its tables."""
         return int(max(self.limits.rows, self.limits.rows_per_byte * self.size))
 
     def refuse_content(self, n_bytes: float) -> None:
-        """Refuse more than the allowed bytes of arrays or decompressed content."""
-        if not n_bytes <= self.content:
+        """Refuse more than the allowed bytes of columns or decompressed content."""
+        self._refuse_bytes(n_bytes, self.content)
+
+    def refuse_arrays(self, n_bytes: float) -> None:
+        """Refuse more than the allowed bytes of arrays; see `arrays`."""
+        self._refuse_bytes(n_bytes, self.arrays)
+
+    def _refuse_bytes(self, n_bytes: float, limit: int) -> None:
+        if not n_bytes <= limit:
             raise FormatError(
                 f"announces {size_text(n_bytes)} in a file of {size_text(self.size)}",
                 where=self.where,

@@ -35,7 +35,7 @@ def open_fits(raw: bytes, budget: Budget) -> fits.HDUList:
 
 def _refuse_unfounded(raw: bytes, budget: Budget) -> None:
     """Refuse a file that ends before the data that its headers announce."""
-    at, number, file_name, clock = 0, 0, budget.where, budget.clock()
+    at, number, file_name, clock, tables = 0, 0, budget.where, budget.clock(), 0
     while raw[at : at + 9] in HDU_STARTS:
         end = raw.find(b"END" + 77 * b" ", at)
         while end >= 0 and (end - at) % 80:
@@ -59,6 +59,8 @@ def _refuse_unfounded(raw: bytes, budget: Budget) -> None:
                 do="it is truncated or damaged: fetch or write it again",
             )
         refuse_many_rows(header, budget)
+        tables += size if _is_table(header) else 0
+        budget.refuse_content(tables)
         at, number = begin + padded(size), number + 1
         budget.refuse_parts(number, "HDUs")
         clock()
@@ -67,8 +69,12 @@ def _refuse_unfounded(raw: bytes, budget: Budget) -> None:
 def refuse_many_rows(header: fits.Header, budget: Budget) -> None:
     """Refuse a table with too many rows, which may have a width of zero bytes."""
     rows = header.get("NAXIS2", 0)
-    if header.get("XTENSION", "") in ("TABLE", "BINTABLE") and isinstance(rows, int):
+    if _is_table(header) and isinstance(rows, int):
         budget.refuse_rows(rows)
+
+
+def _is_table(header: fits.Header) -> bool:
+    return header.get("XTENSION", "") in ("TABLE", "BINTABLE")
 
 
 def refuse_long_arrays(hdu: fits.BinTableHDU, budget: Budget) -> None:

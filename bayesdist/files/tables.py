@@ -142,8 +142,9 @@ def _read_separated(path: Path, limits: Limits, *, mark: str) -> Table:
 
 
 def _read_votable(path: Path, limits: Limits) -> Table:
-    raw, budget = read_unpacked(path, limits)
-    refuse_unsafe_votable(raw, budget)
+    check = VotableCheck(Budget.of_file(path, limits))
+    raw, _ = read_unpacked(path, limits, check.add)
+    check.end()
     table = Table.read(io.BytesIO(raw), format="votable")
     if MAYBE_FOREIGN_BYTES.search(raw) or any(np.ma.is_masked(table[n]) for n in table.colnames):
         _refuse_unreadable_cells(raw, path)
@@ -295,31 +296,43 @@ def read_table(path: Path, limits: Limits = LIMITS) -> Table:
         return reader(path, limits)
 
 
-def refuse_unsafe_votable(raw: bytes, budget: Budget) -> None:
-    """Refuse an unsafe VOTable before astropy reads it.
+class VotableCheck:
+    """Refuses an unsafe VOTable before astropy reads it, while its bytes are decompressed.
 
     Raises FormatError for a document type, data in other files (`href`), sizes that exceed the
     limits, and text that is not XML. Encoding and entities are interpreted by an XML parser, so
     they cannot hide any of these.
     """
-    scan = _Scan(budget)
-    parser = expat.ParserCreate()
-    parser.StartDoctypeDeclHandler = scan.doctype
-    parser.StartElementHandler = scan.begin
-    parser.EndElementHandler = scan.end
-    parser.CharacterDataHandler = scan.text
-    clock = budget.clock()
-    try:
+
+    def __init__(self, budget: Budget) -> None:
+        scan = _Scan(budget)
+        self._where = budget.where
+        self._clock = budget.clock()
+        self._parser = expat.ParserCreate()
+        self._parser.StartDoctypeDeclHandler = scan.doctype
+        self._parser.StartElementHandler = scan.begin
+        self._parser.EndElementHandler = scan.end
+        self._parser.CharacterDataHandler = scan.text
+
+    def add(self, raw: bytes) -> None:
+        """Check the next bytes of the file."""
         for at in range(0, len(raw), _PIECE):
-            parser.Parse(raw[at : at + _PIECE])
-            clock()
-        parser.Parse(b"", True)
-    except (expat.ExpatError, LookupError, ValueError) as error:
-        raise FormatError(
-            f"is not XML that can be read ({error})",
-            where=budget.where,
-            do="fetch or write it again",
-        ) from error
+            self._parse(raw[at : at + _PIECE])
+            self._clock()
+
+    def end(self) -> None:
+        """Check that the file is complete."""
+        self._parse(b"", last=True)
+
+    def _parse(self, raw: bytes, *, last: bool = False) -> None:
+        try:
+            self._parser.Parse(raw, last)
+        except (expat.ExpatError, LookupError, ValueError) as error:
+            raise FormatError(
+                f"is not XML that can be read ({error})",
+                where=self._where,
+                do="fetch or write it again",
+            ) from error
 
 
 def _local(name: str) -> str:
@@ -373,7 +386,7 @@ class _Scan:
         elif name == "FIELD":
             self.fields.append(self._sizes(attributes))
             self.budget.refuse_columns(len(self.fields))
-            self.budget.refuse_content(_CHUNK_ROWS * sum(room for _, room in self.fields))
+            self.budget.refuse_arrays(_CHUNK_ROWS * sum(room for _, room in self.fields))
         elif name == "STREAM":
             self.in_stream, self.letters = True, 0
 
@@ -387,7 +400,7 @@ class _Scan:
             self._refuse_stream()
         elif name == "TABLE":
             self.budget.refuse_cells(self.cells)
-            self.budget.refuse_content(self.rows * sum(room for _, room in self.fields))
+            self.budget.refuse_arrays(self.rows * sum(room for _, room in self.fields))
 
     def text(self, content: str) -> None:
         if self.in_stream:
@@ -419,4 +432,4 @@ class _Scan:
         rows = self.letters * 3 // 4 // width
         self.budget.refuse_rows(rows, "holds")
         self.budget.refuse_cells(rows * len(self.fields))
-        self.budget.refuse_content(rows * sum(room for _, room in self.fields))
+        self.budget.refuse_arrays(rows * sum(room for _, room in self.fields))

@@ -6,7 +6,10 @@ import bz2
 import gzip
 import io
 import lzma
+import re
+import tracemalloc
 import zlib
+from contextlib import nullcontext
 from inspect import signature
 from pathlib import Path
 
@@ -26,12 +29,13 @@ from bayesdist.files.budget import Budget, Limits
 from bayesdist.files.documents import refuse_multiplied_yaml
 from bayesdist.files.fits import open_fits
 from bayesdist.files.hdf5 import hdf5_arrays, netcdf_groups
+from bayesdist.files.regular import PIECE
 from bayesdist.files.tables import TABLE_SUFFIXES, read_table
-from bayesdist.files.unpacked import CODECS, read_unpacked, unpacked
+from bayesdist.files.unpacked import CODECS, TextCounts, read_unpacked, unpacked
 from bayesdist.products.common.content import Content
 
 N = 2000
-SMALL = Limits(content=10_000, content_per_byte=2)
+SMALL = Limits(content=10_000, content_per_byte=2, arrays=10_000)
 COMPRESS = {"gzip": gzip.compress, "bzip2": bz2.compress, "xz": lzma.compress}
 WRITTEN_AS = {
     ".ecsv": "ascii.ecsv", ".csv": "ascii.csv", ".tsv": "ascii.tab", ".fits": "fits",
@@ -76,6 +80,55 @@ def test_content_of_any_kind(codec, tmp_path):
     assert read_unpacked(path)[0] == bytes(100_000)
     with pytest.raises(FormatError, match="holds more than 10 kB"):
         read_unpacked(path, SMALL)
+
+
+@pytest.mark.parametrize("codec", COMPRESS)
+def test_content_that_is_refused_is_not_held(codec):
+    raw, size = 8 * COMPRESS[codec](bytes(PIECE)), 8 * PIECE
+    for most, fits_in in ((size - 1, False), (size, True)):
+        limits = Limits(content=most, content_per_byte=0, held=PIECE // 2)
+        tracemalloc.start()
+        try:
+            if fits_in:
+                assert unpacked(raw, Budget("a", len(raw), limits)) == bytes(size)
+            else:
+                with pytest.raises(FormatError, match=r"holds more than 134 MB"):
+                    unpacked(raw, Budget("a", len(raw), limits))
+            peak = tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+        assert (peak < 6 * PIECE) != fits_in
+
+
+@pytest.mark.parametrize("codec", COMPRESS)
+def test_content_in_several_streams(codec):
+    first, second = COMPRESS[codec](b"x,y\n"), COMPRESS[codec](b"1,2\n")
+    padding = b"" if codec == "bzip2" else bytes(4)
+    assert unpacked(first + second + padding, Budget("a", 100)) == b"x,y\n1,2\n"
+
+
+def test_xz_with_a_large_dictionary():
+    filters = [{"id": lzma.FILTER_LZMA2, "dict_size": 2**30}]
+    stream = io.BytesIO()
+    with lzma.open(stream, "wb", filters=filters) as file:
+        file.write(b"x,y\n1,2\n")
+    with pytest.raises(FormatError, match=r"is a broken xz file \(Memory usage limit"):
+        unpacked(stream.getvalue(), Budget("a", 100))
+
+
+@pytest.mark.parametrize("end", ["\n", "\r", "\r\n"])
+def test_rows_and_cells_are_counted_over_all_pieces(end):
+    text = end.join(f"{k} {k}, {k}\t{k}" for k in range(10)).encode() + end.encode()
+    for step in (1, 2, 3, 1000):
+        for limits, words in [
+            (Limits(rows=10, rows_per_byte=0, cells=40, cells_per_byte=0), None),
+            (Limits(rows=9, rows_per_byte=0), "holds 10 rows"),
+            (Limits(cells=39, cells_per_byte=0), "holds 40 cells"),
+        ]:
+            counts = TextCounts(Budget("a", 100, limits), compressed=True)
+            with nullcontext() if words is None else pytest.raises(FormatError, match=words):
+                for at in range(0, len(text), step):
+                    counts.add(text[at : at + step])
 
 
 @pytest.mark.parametrize("codec", COMPRESS)
@@ -130,6 +183,19 @@ def test_blocks_of_asdf(codec):
     for limits in (Limits(), SMALL):
         with pytest.raises(FormatError, match=r"and holds others|announces \d"):
             asdf_tree(less, Budget("a.asdf", len(raw), limits), max_order=12)
+
+
+def test_asdf_of_many_blocks_and_of_constant_planes():
+    asdf = pytest.importorskip("asdf")
+    for tree in (
+        {f"a{k}": np.full(20, float(k)) for k in range(1200)},
+        {"u": np.zeros((2048, 2048)), "v": np.ones((2048, 2048))},
+    ):
+        stream = io.BytesIO()
+        asdf.AsdfFile(tree).write_to(stream, all_array_compression="zlib")
+        raw = stream.getvalue()
+        out = asdf_tree(raw, Budget("a.asdf", len(raw)), max_order=12)
+        assert all(np.array_equal(out[name], values) for name, values in tree.items())
 
 
 def test_chunks_of_hdf5_that_hold_more_than_a_chunk(tmp_path):
@@ -250,7 +316,7 @@ ARRAY = "!<tag:stsci.edu:asdf/core/ndarray-1.1.0> {{source: {}, shape: {}, datat
 @pytest.mark.parametrize(
     ("node", "words"),
     [
-        (ARRAY.format(0, "[100000, 100000]", ", strides: [0, 0]"), r"holds 1e\+10 cells"),
+        (ARRAY.format(0, "[100000, 100000]", ", strides: [0, 0]"), "announces 80 GB"),
         (ARRAY.format("file:///etc/passwd", "[10]", ""), "an array lies in another file"),
         ("{$ref: 'http://127.0.0.1:9/a.asdf#/b'}", "refers to another file"),
         (
@@ -441,6 +507,20 @@ def test_parts_and_cards_of_fits():
             open_fits(raw, Budget("a.fits", len(raw), limits))
 
 
+def test_images_may_be_constant_and_tables_may_not(tmp_path):
+    """A plane of 67 MB is compressed to less than a thousandth."""
+    path = tmp_path / "a.fits.gz"
+    rows = np.zeros(2**16, [("x", "f8", 128)])
+    for hdu, words in (
+        (fits.ImageHDU(np.zeros((4096, 4096), np.float32)), None),
+        (fits.BinTableHDU(rows), "announces 67.1 MB in a file of"),
+    ):
+        path.write_bytes(gzip.compress(_fits(hdu), 1))
+        with nullcontext() if words is None else pytest.raises(FormatError, match=words):
+            raw, budget = read_unpacked(path)
+            assert open_fits(raw, budget)[1].data.shape == (4096, 4096)
+
+
 def test_compressed_images_are_not_decompressed(tmp_path):
     raw = _fits(
         fits.CompImageHDU(np.zeros((100, 100))),
@@ -536,6 +616,19 @@ def test_sizes_of_a_votable(tmp_path):
         ]:
             with pytest.raises(FormatError, match=words):
                 read_table(path, limits)
+
+
+def test_texts_of_a_great_width(tmp_path):
+    """Reading a VOTable begins with memory for 256 rows."""
+    path = tmp_path / "a.vot"
+    fields = '<FIELD name="{}" datatype="char" arraysize="4000"/>'
+    text = _votable(path).replace("<DATA>", "{}<DATA>")
+    text = re.sub(r"</TR>", 20 * "<TD>a b</TD>" + "</TR>", text)
+    path.write_text(text.format("".join(fields.format(f"t{k}") for k in range(20))))
+    assert list(read_table(path)["t19"]) == 50 * ["a b"]
+    path.write_text(text.format("".join(fields.format(f"t{k}") for k in range(40))))
+    with pytest.raises(FormatError, match="announces 139 MB"):
+        read_table(path)
 
 
 def test_binary_rows_of_no_bytes(tmp_path):
