@@ -72,7 +72,7 @@ class Budget:
 
     @property
     def content(self) -> int:
-        """Largest size of the content in bytes, limited by the available memory."""
+        """Largest allowed size of the content in bytes, also limited by the available memory."""
         limit = max(self.limits.content, self.limits.content_per_byte * self.size)
         return int(min(memory_limit(), limit))
 
@@ -83,7 +83,7 @@ class Budget:
 
     @property
     def rows(self) -> int:
-        """Largest number of rows of its tables."""
+        """Largest allowed number of rows of a table."""
         return int(max(self.limits.rows, self.limits.rows_per_byte * self.size))
 
     def refuse_content(self, n_bytes: float) -> None:

@@ -41,9 +41,9 @@ def raising_interrupts() -> Iterator[None]:
 class InterruptHandler:
     """Handler of SIGINT and SIGTERM for a program, which raises KeyboardInterrupt for each of them.
 
-    A second signal soon after the first changes nothing, because what is open is closed then, and
-    an interrupt in the midst of that would leave a traceback.  After `again` seconds the first one
-    may have been lost, and another one counts.
+    A second signal within `again` seconds of the first is ignored, because open files are being
+    closed then, and another interrupt would leave a traceback.  A later signal counts, since the
+    first one may have been lost.
     """
 
     def __init__(self, again: float = 2.0) -> None:
@@ -67,9 +67,9 @@ class InterruptHandler:
             raise KeyboardInterrupt
 
     def repeat_lost(self, unraisable: Any) -> None:
-        """Hook of `sys.unraisablehook`: repeat an interrupt that Python would print and ignore.
+        """Hook for `sys.unraisablehook`: repeat an interrupt that Python would print and ignore.
 
-        That happens to exceptions in destructors and in callbacks of weak references, which may run
+        Python ignores exceptions in destructors and in callbacks of weak references, which may run
         at any time.
         """
         if not isinstance(unraisable.exc_value, KeyboardInterrupt):
@@ -81,9 +81,9 @@ class InterruptHandler:
 
 
 def installed_handler() -> InterruptHandler | None:
-    """Handler of this program; None if there is none.
+    """Interrupt handler of this program; None if none is installed.
 
-    Jobs in the background ignore SIGINT, so that only SIGTERM may have it.
+    Background jobs ignore SIGINT, so that the handler may be installed for SIGTERM only.
     """
     for number in (signal.SIGINT, signal.SIGTERM):
         handler = signal.getsignal(number)
@@ -141,8 +141,8 @@ def deferred_interrupts() -> Iterator[None]:
 def blocked_interrupts() -> Iterator[None]:
     """Delay Ctrl-C until the end of the block; processes that are started in it never receive one.
 
-    A terminal sends Ctrl-C to them, too, and they would print tracebacks.  Nothing is blocked where
-    the system cannot do that.
+    A terminal sends Ctrl-C to child processes, too, and they would print tracebacks.  On systems
+    without signal masks (Windows) nothing is delayed.
     """
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield
@@ -156,7 +156,7 @@ def blocked_interrupts() -> Iterator[None]:
 
 @contextmanager
 def naming_faults(path: Path, where: str = "") -> Iterator[None]:
-    """Convert any exception while a file is read to an error with its name, or with `where`.
+    """Convert any exception while a file is read to an error that names the file, or `where`.
 
     Readers of damaged files raise many kinds of exceptions, so all are caught; only InputError
     passes unchanged. Raises InputError if the system refuses to read, FormatError if the content

@@ -281,9 +281,10 @@ def parquet_column(values: pyarrow.ChunkedArray, unit: str | None) -> Column:
 
 
 def numpy_array(values: pyarrow.Array) -> NDArray[Any]:
-    """Values (N,) of an Arrow array, arbitrary where null; numbers are a read-only view.
+    """Values (N,) of an Arrow array; null entries are arbitrary, and numbers are a read-only view.
 
-    The conversion in Arrow imports pandas, which takes longer than reading a small table.
+    It is used because the conversion by Arrow imports pandas, which takes longer than reading a
+    small table.
     """
     import pyarrow
     from pyarrow import types

@@ -108,7 +108,8 @@ def _irregular(path: PathLike, kind: int, do: str = "give a regular file") -> In
 def read_bytes(path: PathLike, *, most: int | None = None) -> bytes:
     """Content of a file.
 
-    `most`: largest plausible number of bytes; by default limited by the available memory.
+    `most`: largest plausible number of bytes; by default limited by the available memory. Raises
+    InputError if the file cannot be read, and an error if it has more than `most` bytes.
     """
     most = memory_limit() if most is None else most
     with opened(path) as stream:
@@ -131,9 +132,10 @@ def read_bytes(path: PathLike, *, most: int | None = None) -> bytes:
 
 
 def read_up_to(stream: BinaryIO | io.BufferedIOBase, most: int, *, expected: int = PIECE) -> bytes:
-    """Bytes of a stream, at most `most` + 1; read at once if it has the expected number of bytes.
+    """Bytes of a stream: all of them, or the first `most` + 1 if there are more.
 
-    Python allocates the requested number of bytes before it reads.
+    A stream of `expected` bytes is read at once. Python allocates the requested number of bytes
+    before it reads, so that larger streams are read in blocks.
     """
     parts, n = [], expected + 1
     while n and (part := stream.read(n)):
@@ -164,7 +166,7 @@ def decoded(raw: bytes, where: str) -> str:
 
 
 def head_of(path: PathLike, n: int = 4096) -> bytes:
-    """First bytes of a file; empty if it cannot be read, which its reader will report."""
+    """First n bytes of a file; empty if it cannot be read (its reader will report the error)."""
     try:
         with opened(path) as stream:
             return stream.read(n)

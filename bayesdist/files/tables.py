@@ -1,6 +1,7 @@
-"""Read table files into an astropy Table; anything wrong with a file becomes one clear error.
+"""Reading of table files into an astropy Table; any fault of a file becomes a single clear error.
 
-Check that a VOTable refers to no other files and holds no more than its size allows.
+VOTables are checked before they are read: they must not refer to other files, nor announce more
+content than their size allows.
 """
 
 from __future__ import annotations
@@ -258,7 +259,7 @@ TABLE_SUFFIXES: dict[str, Callable[[Path, Limits], Table]] = {
 
 
 def is_binary(path: Path) -> bool:
-    """True if a file is not text; False if it cannot be read, which its reader will report."""
+    """True if a file is not text; False if it cannot be read (its reader will report the error)."""
     head = head_of(path)
     return b"\0" in head or head.startswith(FITS_START)
 

@@ -78,10 +78,10 @@ def _rows_of(lines: Sequence[str]) -> list[str]:
 
 
 def mark_of(rows: Sequence[str]) -> str | None:
-    """Separator between the cells of rows, with the names in the first row; None for blanks.
+    """Separator between the cells of a table, with the names in the first row; None for blanks.
 
-    It divides the names and the first row of numbers into the same number of cells. If no separator
-    does, it is the first one that occurs in the names.
+    It is the separator that divides the names and the first row of numbers into the same number of
+    cells. If there is none, it is the first separator that occurs in the names.
     """
     names = rows[0]
     present = [mark for mark in _MARKS if mark is None or mark in names]
@@ -213,7 +213,7 @@ def parse_text_table(lines: Sequence[str], budget: Budget) -> Table:
 
 
 def without_empty_names(lines: list[str], mark: str | None) -> list[str]:
-    """Remove trailing separators after the names that the first row does not have."""
+    """Remove separators at the end of the line of names that the first row of the table lacks."""
     rows = [k for k, line in enumerate(lines) if line.strip() and not line.lstrip().startswith("#")]
     if mark is None or len(rows) < 2:
         return lines
@@ -226,7 +226,7 @@ def without_empty_names(lines: list[str], mark: str | None) -> list[str]:
 
 
 def refuse_missing_cells(lines: Sequence[str], mark: str, *, where: str) -> None:
-    """Refuse rows with fewer cells than names, which astropy fills up without a warning."""
+    """Raise FormatError if a row has fewer cells than names; astropy fills it without a warning."""
     width, row = 0, 0
     for cells in csv.reader((line for line in lines if line[:1] != "#"), delimiter=mark):
         if not cells or cells == [""]:
@@ -268,7 +268,7 @@ def refuse_cut_end(lines: Sequence[str], mark: str | None, *, where: str) -> Non
 
 
 def columns_of_numbers(table: Table) -> dict[str, bool]:
-    """True for each column of a table that holds numbers."""
+    """Map from the name of each column of a table to True if the column holds numbers."""
     return {name: table[name].dtype.kind in "iuf" for name in table.colnames}
 
 

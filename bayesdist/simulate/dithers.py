@@ -1,8 +1,7 @@
-"""Simulated dithered exposures, and dither patterns.
+"""Simulated dithered exposures of a dense field, and dither patterns.
 
-Simulated dithered exposures of a dense field: pointings, and pixel positions of the stars.
-
-Dither patterns: pointings and roll angles of exposures.
+The simulations contain the pointings and the pixel positions of the stars.  Dither patterns are
+pointings and roll angles of exposures.
 """
 
 from __future__ import annotations
@@ -38,9 +37,8 @@ def dither_pattern(
 ) -> tuple[Float, Float]:
     """Offsets and roll angles of dithered exposures that sample all spatial scales.
 
-    As in calibration programmes of HST, the logarithms of the offset
-    lengths are uniformly distributed, the directions are random, and the roll angles are used
-    cyclically.
+    As in calibration programmes of HST, the logarithms of the offset lengths are uniformly
+    distributed, the directions are random, and the roll angles are used cyclically.
 
     Parameters
     ----------
@@ -103,7 +101,10 @@ def dithered_model(
 
 
 def sky_seen(model: DistortionModel, theta: Float) -> tuple[Float, Float]:
-    """Lower and upper corner (2,) of the rectangle that contains the corners of all exposures."""
+    """Lower and upper corner (2,) of the rectangle that contains the corners of all exposures.
+
+    Corners are positions (u, v) in the unit of the model.
+    """
     corners = []
     for chip in model.chips:
         right, top = (n + 0.5 for n in chip.size)
@@ -119,7 +120,7 @@ def sky_seen(model: DistortionModel, theta: Float) -> tuple[Float, Float]:
 def stars_on_detector(
     model: DistortionModel, theta: Float, sky: Float
 ) -> tuple[Float, Float, Int, Int, Int]:
-    """Detections of the stars at positions `sky` (S, 2) in all exposures.
+    """Detections of the stars at positions (u, v) `sky` (S, 2) in all exposures.
 
     Returns
     -------

@@ -1,8 +1,7 @@
-"""Simulated matches of stars, for a distortion model or as a catalogue of a camera.
+"""Simulated matches with measurement errors and false matches.
 
-Simulated matches for a given distortion model, with measurement errors and false matches.
-
-Simulated SExtractor catalogue of one exposure, matched to Gaia, with false matches.
+The matches follow a given distortion model, or are a SExtractor catalogue of one exposure that is
+matched to Gaia.
 """
 
 from __future__ import annotations
@@ -46,7 +45,7 @@ class Truth:
     theta : ndarray, shape (D,)
         True parameters of the model.
     fraction : float
-        Probability of a false match.
+        Probability that a match is false.
     jitter : float
         Error per axis that is added in quadrature to the quoted errors, in the unit of u and v.
     outlier_scale : float
@@ -99,8 +98,8 @@ def simulate_matches(
     outliers : str
         Distribution of the offsets of false matches: 'gaussian', or 'uniform' on the match circle
         of radius `outlier_scale`.
-    epochs : array_like, optional
-        Date of each exposure in decimal years.
+    epochs : array_like, shape (E,), optional
+        Date of each exposure in decimal years; required by a model with time dependence.
 
     Returns
     -------

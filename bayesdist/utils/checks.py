@@ -59,7 +59,7 @@ def in_order(checks: Iterable[Check]) -> tuple[Check, ...]:
 
 
 def level_of(good: bool, bad: str = "fail") -> str:
-    """'pass' if the criterion is met, otherwise the level `bad`."""
+    """'pass' if `good` (the criterion is met), otherwise the level `bad`."""
     return "pass" if good else bad
 
 

@@ -27,7 +27,8 @@ def matern(separation: Float) -> Float:
 def correlation_at(separation: Float, correlation: Correlation) -> Float:
     """Correlation of a sum of fields at a separation, in the unit of the correlation lengths.
 
-    If the fractions add up to less than 1, the remaining variance is uncorrelated.
+    `correlation` has the fraction of the variance and the correlation length of each field.  If the
+    fractions add up to less than 1, the remaining variance is uncorrelated.
     """
     out = np.zeros(np.shape(separation))
     for fraction, length in correlation:
@@ -38,11 +39,12 @@ def correlation_at(separation: Float, correlation: Correlation) -> Float:
 def drawn_fields(
     at: Float, correlation: Correlation, n: int, rng: np.random.Generator, waves: int = 256
 ) -> Float:
-    """Draws (N, n) of the correlated part of a field of unit variance, at positions (N, 2).
+    """Draws (N, n) of the correlated part of a field of unit variance, at positions `at` (N, 2).
 
-    Each draw is a sum of waves with random phases and with frequencies drawn from the spectral
-    density of the field (random Fourier features, Rahimi and Recht 2007).  The covariance, averaged
-    over all draws, is exact.
+    `correlation` has the fraction of the variance and the correlation length of each component.
+    Each draw is a sum of `waves` waves with random phases and with frequencies drawn from the
+    spectral density of the field (random Fourier features, Rahimi and Recht 2007).  The covariance,
+    averaged over all draws, is exact.
     """
     out = np.zeros((len(at), n))
     for fraction, length in correlation:

@@ -49,7 +49,7 @@ def _power_of_ten(x: float, decimals: int, exponent: int) -> str:
 
 
 def number(value: Any, digits: int = 3) -> str:
-    """Number with some significant digits, with a power of ten if it is very small or large.
+    """Number with `digits` significant digits, with a power of ten if it is very small or large.
 
     `MISSING` if the value is missing or not a number.
     """
@@ -90,13 +90,13 @@ def interval(low: Any, high: Any, sigma: Any) -> str:
 
 
 def count(value: Any) -> str:
-    """Integer with its digits in groups of three."""
+    """Integer with its digits in groups of three; `MISSING` if the value is not finite."""
     x = _finite(value)
     return MISSING if x is None else f"{round(x):,}".replace(",", "\u202f").translate(_MINUS)
 
 
 def percent(value: Any, digits: int = 3) -> str:
-    """Fraction as a percentage."""
+    """Fraction as a percentage; `MISSING` if the value is not finite."""
     x = _finite(value)
     return MISSING if x is None else f"{number(100 * x, digits)}\u202f%"
 
@@ -208,7 +208,7 @@ def ladder(unit: str) -> tuple[tuple[float, str], ...]:
 
 
 def length_scale(unit: str, like: float) -> Scale:
-    """Display unit of lengths like `like`: pixels, or an angular unit that avoids zeros."""
+    """Display unit of lengths as large as `like`: pixels, or an angular unit that avoids zeros."""
     return Scale(1.0, "pix") if unit == "pix" else display_scale(unit, like)
 
 

@@ -1,4 +1,4 @@
-"""Names and other short texts: what they may hold, and how ASCII has them."""
+"""Names and other short texts: allowed characters, and conversion to ASCII."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _CONTROLS = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 
 
 def ascii_of(text: str) -> str:
-    """Text in printable ASCII, as FITS headers have it.
+    """Text converted to printable ASCII, which FITS headers require.
 
     Accents are dropped, Greek letters are spelled out, dashes become "-"; compatibility characters
     are replaced ("²" by "2"), and any other character, including control characters, becomes "?".
@@ -58,10 +58,11 @@ def _substitute(character: str) -> str:
 
 
 def number_of(text: str) -> float:
-    """Number of a text in ASCII decimals, "nan", "inf" or "infinity"; blanks around it may be.
+    """Number written in a text as ASCII decimals, "nan", "inf" or "infinity".
 
-    ValueError for any other text.  Python's `float` takes "1_00" and digits of other scripts for
-    100, and C takes "0x64" for it: no format of tables does.
+    Blanks around the number are allowed.  Raises ValueError for any other text, including "1_00",
+    digits of other scripts (both accepted by Python's `float`) and "0x64" (accepted by C), which no
+    table format allows.
     """
     plain = text.strip(" \t\r\n")
     if _NUMBER.fullmatch(plain) is None:
@@ -70,9 +71,10 @@ def number_of(text: str) -> float:
 
 
 def refuse_control_characters(texts: Iterable[str], where: str) -> None:
-    """Refuse (InputError) a name with a control character, such as a line end, a tab or NUL.
+    """Raise InputError if a name contains a control character, such as a line end, a tab or NUL.
 
-    Tables, headers and reports put a name on one line, and netCDF files end it at NUL.
+    Names are written on one line in tables, headers and reports, and netCDF files end them at NUL.
+    `where` is the location for the error message.
     """
     for text in texts:
         found = _CONTROLS.search(text)
