@@ -23,10 +23,10 @@ from bayesdist.utils.arrays import Float
 
 
 def turned_model(model: DistortionModel) -> DistortionModel:
-    """Model for the transformed solution of a model without frames.
+    """Model that can hold a rotated solution of a model without frames.
 
-    A rotation mixes the axes, so that each drifting term needs a counterpart on the other axis.
-    The original drifting terms come first, followed by their counterparts.
+    A rotation mixes the axes, so that each drifting term needs a counterpart on the other axis. The
+    original drifting terms come first, followed by their counterparts.
     """
     time = model.time
     if time is None:
@@ -108,7 +108,7 @@ def without(fields: Float, norm: Float) -> Float:
 def frame_between(old: Float, now: Float, model: DistortionModel) -> tuple[Float, Float]:
     """Frame (matrix, shift) that best maps old polynomials (chips, 2, K) to new ones.
 
-    The frame is of the kind `model.frames`.
+    `old` and `now` are Legendre coefficients.  The frame is of the kind `model.frames`.
     """
     if model.frames == "none":
         return np.eye(2), np.zeros(2)

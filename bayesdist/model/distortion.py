@@ -160,7 +160,10 @@ class DistortionModel(EffectiveCoefficients):
         return np.array([code_of[name] for name in flat], np.int64).reshape(np.shape(exposure))
 
     def drift_terms(self, chip: int | None = None) -> Float:
-        """Legendre coefficients (n drifting terms, K) of a chip's drifting monomials."""
+        """Legendre coefficients (n drifting terms, K) of the drifting monomials.
+
+        `chip` is a chip number (default: the first chip).
+        """
         return self.drift_columns[0][0 if chip is None else self.chip_code(chip)]
 
     def predict(
@@ -225,6 +228,12 @@ class DistortionModel(EffectiveCoefficients):
         Returns
         -------
         ndarray, shape (N, 2, n_params)
+            In the unit of u and v per unit of each parameter.
+
+        Raises
+        ------
+        InputError
+            If theta has a wrong length, or an argument is invalid (see `groups`).
         """
         theta = self._checked(theta)
         x, y = np.broadcast_arrays(np.atleast_1d(x), np.atleast_1d(y))
@@ -258,6 +267,11 @@ class DistortionModel(EffectiveCoefficients):
         -------
         ndarray, shape (N, 2, 2)
             [[du/dx, du/dy], [dv/dx, dv/dy]], in the unit of u and v per pixel.
+
+        Raises
+        ------
+        InputError
+            If theta has a wrong length, or an argument is invalid (see `groups`).
         """
         px, py = np.broadcast_arrays(np.atleast_1d(x), np.atleast_1d(y))
         groups = self.groups(px.size, epoch=epoch, exposure=exposure, chip=chip)
@@ -279,8 +293,14 @@ class DistortionModel(EffectiveCoefficients):
         Returns
         -------
         position : ndarray, shape (N, 2)
+            In the unit of u and v.
         slope : ndarray, shape (N, 2, 2)
             See `slopes`.
+
+        Raises
+        ------
+        InputError
+            If theta has a wrong length.
         """
         effective = self.effective(self._checked(theta), groups)
         position, slope = np.empty((x.size, 2)), np.empty((x.size, 2, 2))
@@ -306,6 +326,11 @@ class DistortionModel(EffectiveCoefficients):
         float
             1 if the unit of u and v is the pixel; otherwise the square root of the pixel area,
             without drift and frames.
+
+        Raises
+        ------
+        InputError
+            If there is no such chip.
         """
         return 1.0 if self.unit == "pix" else self.linear_scale(theta, chip)
 
@@ -321,6 +346,11 @@ class DistortionModel(EffectiveCoefficients):
         -------
         float
             Square root of the pixel area in the unit of u and v, without drift and frames.
+
+        Raises
+        ------
+        InputError
+            If there is no such chip.
         """
         theta, basis = np.asarray(theta, float), self.basis(chip)
         linear = [

@@ -318,7 +318,7 @@ def merge_groups(a: Groups, b: Groups) -> tuple[Groups, Int, Int]:
     -------
     groups : Groups
         Union of the groups, without members.
-    of_a, of_b : ndarray of int
+    of_a, of_b : ndarray of int, shapes (len(a),) and (len(b),)
         Indices of the groups of `a` and of `b` in the union.
     """
     union = group_by(

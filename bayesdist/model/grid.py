@@ -15,7 +15,9 @@ BYTES_OF_POINT = 500  # lower bound: position, basis functions and some draws of
 def grid_pixels(size: tuple[float, float], grid: tuple[int, int]) -> tuple[Float, Float]:
     """Pixels x (nx,) and y (ny,) of a regular grid from pixel 1 to the size, FITS 1-based.
 
-    Raises InputError unless the grid is given by two integers of at least 2.
+    `size` and `grid` have the numbers of pixels and of grid points along x and y.  Raises
+    InputError unless the grid is given by two integers of at least 2, and MemoryLimitError if it is
+    too large.
     """
     if len(grid) != 2 or any(int(n) != n or n < 2 for n in grid):
         raise InputError(
@@ -53,7 +55,10 @@ def cell_index(X: Float, Y: Float, bins: tuple[int, int]) -> Int:
 
 
 def outline_pixels(size: tuple[float, float]) -> tuple[Float, Float]:
-    """Pixels along the outline of a chip, nine per side since the sides are curved on the sky."""
+    """Pixels x and y (36,) along the outline of a chip, FITS 1-based.
+
+    There are nine per side, since the sides are curved on the sky.
+    """
     nx, ny = size
     t = np.linspace(0, 1, 9)
     x = 0.5 + nx * np.concatenate([t, 1 + 0 * t, 1 - t, 0 * t])

@@ -34,9 +34,15 @@ class Chip:
         Chip number, as in the data and in calibration files.
     name : str
     size : tuple of float or Quantity
-        Numbers of columns and rows.
+        Numbers of columns and rows, in pixels.
     reference_pixel : tuple of float or Quantity
-        Origin of the polynomial, in FITS 1-based pixels.
+        Origin of the polynomial's monomial form, in FITS 1-based pixels.
+
+    Raises
+    ------
+    InputError
+        If the number is not an integer, the name has control characters, or the size or the
+        reference pixel is not a pair of finite numbers (positive for the size).
 
     Examples
     --------
@@ -117,7 +123,10 @@ class Parameter:
 
 @dataclass(frozen=True)
 class ParameterLayout:
-    """Fields of a `DistortionModel` (documented there), and the layout of its parameters."""
+    """Fields of a `DistortionModel` (documented there), and the layout of its parameters.
+
+    Chip codes and exposure codes are indices into `chips` and `exposures`.
+    """
 
     order: int
     chips: tuple[Chip, ...]
@@ -262,7 +271,10 @@ class ParameterLayout:
         return self.n_distortion + len(self.free_frame_names(0))
 
     def free_frame_names(self, exposure: int) -> tuple[str, ...]:
-        """Names of the fitted parameters of an exposure code: frame, then chip deviations."""
+        """Names of the fitted parameters of one exposure: its frame, then its chip deviations.
+
+        `exposure` is an exposure code (index into `exposures`).
+        """
         if exposure > 0:
             return (*frame_names(self.frames), *self._own_names)
         if self.gauge == "first" or exposure < 0:
@@ -392,9 +404,9 @@ class ParameterLayout:
 
     @cached_property
     def drift_columns(self) -> tuple[tuple[Float, ...], Int]:
-        """Legendre coefficients (n terms, K) of the drifting monomials per chip, and their axes.
+        """Legendre coefficients of each chip's drifting monomials, and the axes of these terms.
 
-        Axes (n terms,) are 0 for u and 1 for v.
+        There is one array (n terms, K) per chip.  The axes (n terms,) are 0 for u and 1 for v.
         """
         if self.time is None:
             return tuple(np.zeros((0, self.n_terms)) for _ in self.chips), np.zeros(0, np.int64)
