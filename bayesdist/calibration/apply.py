@@ -173,7 +173,7 @@ class Application:
         return float(np.hypot(back.x - x, back.y - y).max())
 
     def plane(self, X: ArrayLike, Y: ArrayLike) -> Float:
-        """Positions (2, N), in the unit of the calibration, of output pixels."""
+        """Positions (u, v), shape (2, N), of output pixels (N,), in the unit of the calibration."""
         at = np.stack([np.atleast_1d(np.asarray(v, float)) for v in (X, Y)])
         return (at - np.array(self.frame.origin)[:, None]) / self.frame.pixels_per_unit
 
@@ -190,7 +190,7 @@ def frame_that_holds(
 ) -> tuple[OutputFrame, tuple[int, int]]:
     """Smallest output frame that contains all chips, and its numbers of columns and rows.
 
-    The origin of the frame is a whole pixel.
+    `scale` and `vafactor` are those of `OutputFrame`.  The origin of the frame is a whole pixel.
     """
     plain = Application(chips, OutputFrame(scale, vafactor=vafactor))
     at = []

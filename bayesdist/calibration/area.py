@@ -27,9 +27,10 @@ _MAGNITUDES = 2.5 / np.log(10.0)
 def determinant(
     basis: PolynomialBasis, polynomial: Float, x: Float, y: Float
 ) -> tuple[Float, Float]:
-    """Jacobian determinants (N,) of (u, v), and their derivatives (N, 2 K).
+    """Jacobian determinants (N,) of (u, v) with respect to (x, y), and their derivatives (N, 2 K).
 
-    The derivatives are with respect to the coefficients `polynomial` (2, K), u before v.
+    The derivatives are with respect to the Legendre coefficients `polynomial` (2, K), u before v.
+    x and y (N,) are FITS 1-based pixels.
     """
     px, py = basis.gradient(x, y)
     (ux, vx), (uy, vy) = polynomial @ px.T, polynomial @ py.T
@@ -109,7 +110,7 @@ class PixelAreaMap:
 
     @property
     def magnitude(self) -> Float:
-        """Magnitude correction (ny, nx) that the map causes for point sources."""
+        """Magnitude correction (ny, nx) for point sources: -2.5 log10 of the area."""
         return -2.5 * np.log10(self.area)
 
     @property

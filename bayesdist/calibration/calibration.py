@@ -164,6 +164,11 @@ class Calibration:
         Returns
         -------
         Calibration
+
+        Raises
+        ------
+        InputError
+            If `solution` is not a LinearFit or Posterior, or `point` is not a direction.
         """
         if not isinstance(solution, Solution):
             raise InputError(
@@ -260,18 +265,19 @@ class Calibration:
         return out
 
     def in_frame(self, epoch: float | None = None) -> dict[int, ChipMap]:
-        """Maps with look-up tables for an output frame.
+        """Maps of all chips, by chip number, with the look-up tables, for use with an output frame.
 
-        In a free plane (u, v) = 0 is at the reference pixel of the reference chip.
+        `epoch` is in decimal years.  In a free plane (u, v) = 0 is at the reference pixel of the
+        reference chip.
         """
         origin = "reference" if self.plane.kind == "free" else "stated"
         return self.with_tables(self.at(epoch, origin=origin))
 
     def by_chip(self, epoch: float | None = None) -> dict[int, ChipMap]:
-        """Polynomials for the comparison of single chips, without look-up tables.
+        """Maps of all chips by chip number, without look-up tables, for comparisons chip by chip.
 
-        In an aperture (u, v) = 0 is at the reference pixel of each chip.  Look-up tables are
-        approximated by a polynomial; a note states the residuals.
+        `epoch` is in decimal years.  In an aperture (u, v) = 0 is at the reference pixel of each
+        chip. Look-up tables are approximated by a polynomial; a note states the residuals.
         """
         maps = self.at(epoch, origin="chip" if self.plane.kind == "aperture" else "stated")
         if not self.before and not self.after:
@@ -287,7 +293,7 @@ class Calibration:
         return out
 
     def with_tables(self, maps: Mapping[int, ChipMap]) -> dict[int, ChipMap]:
-        """Add the look-up tables of the calibration to the maps of chips."""
+        """Maps of chips, by chip number, with the look-up tables of the calibration added."""
         return {
             number: replace(
                 chip_map,
@@ -311,7 +317,11 @@ class Calibration:
     def joint_covariance(
         self, numbers: Sequence[int], epoch: float | None = None, *, origin: str = "reference"
     ) -> Float | None:
-        """Covariance (2 K n, 2 K n) of the coefficients of n chips; None without errors."""
+        """Covariance (2 K n, 2 K n) of the coefficients of n chips; None without errors.
+
+        `numbers` are chip numbers.  Within each chip u comes before v.  See `at` for `epoch` and
+        `origin`.
+        """
         if self.errors == "none":
             return None
         parts = [self.coefficients(number, epoch, origin)[1] for number in numbers]
@@ -322,7 +332,28 @@ class Calibration:
     def forward(
         self, x: ArrayLike, y: ArrayLike, *, chip: int, epoch: float | None = None
     ) -> Float:
-        """Positions (u, v), shape (N, 2), of pixels (N,), FITS 1-based, with look-up tables."""
+        """Positions (u, v) of pixels, including look-up tables.
+
+        Parameters
+        ----------
+        x, y : array_like, shape (N,)
+            FITS 1-based pixels.
+        chip : int
+            Chip number.
+        epoch : float, optional
+            Decimal years; `reference_date` by default.
+
+        Returns
+        -------
+        ndarray, shape (N, 2)
+            In the unit of u and v.
+
+        Raises
+        ------
+        InputError
+            If the chip is unknown, the calibration cannot be evaluated at the date, or a required
+            date is missing.
+        """
         px, py = np.asarray(x, float), np.asarray(y, float)
         if self.before:
             px, py = corrected(self.before, px, py, chip=chip, filter=self.filter)
@@ -390,7 +421,7 @@ class Calibration:
         return self.reference_date if epoch is None else epoch
 
     def at_date(self, epoch: float | None = None) -> Calibration:
-        """Calibration at one date, without time dependence."""
+        """Calibration at one date, in decimal years, without time dependence."""
         if self.model.time is None:
             return self
         at_epoch = calibration_of_maps(
@@ -404,7 +435,7 @@ class Calibration:
         )
 
     def only(self, number: int, epoch: float | None = None) -> Calibration:
-        """Calibration of a single chip at one date."""
+        """Calibration of a single chip, by its number, at one date in decimal years."""
         chip_map = self.chip(number, epoch, origin="stated")
         single = calibration_of_maps(
             {number: chip_map}, self.name, cov=chip_map.cov, errors=self.errors

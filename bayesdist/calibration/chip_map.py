@@ -249,7 +249,7 @@ class ChipMap:
         return coefficients, cov.reshape(2 * n_terms, 2 * n_terms)
 
     def transformed(self, linear: ArrayLike, shift: ArrayLike = (0.0, 0.0)) -> ChipMap:
-        """Map to the positions linear (u, v) + shift; the transformation is taken as exact."""
+        """Map to the positions linear @ (u, v) + shift; the transformation is taken as exact."""
         L = np.asarray(linear, float)
         after = tuple(
             replace(t, values=np.einsum("ab,byx->ayx", L, t.values), sigma=None) for t in self.after
@@ -263,7 +263,7 @@ class ChipMap:
         return replace(self, coefficients=coefficients, cov=cov, after=after)
 
     def polynomial(self, order: int) -> tuple[ChipMap, float, float]:
-        """Approximate the map by a polynomial of some order without look-up tables.
+        """Approximate the map by a polynomial of the given order without look-up tables.
 
         The polynomial is fitted over the detector, and the covariance is that of the common terms.
         A map without look-up tables is returned unchanged if its order is not above `order`.
@@ -445,10 +445,10 @@ def fitted_map(
 def position_moments(
     coefficients: Float, basis: PolynomialBasis, x: Float, y: Float
 ) -> tuple[Float, Float, Float]:
-    """Variance of u, of v, and covariance, each (N,), from those of the coefficients.
+    """Variance of u, variance of v, and covariance of u and v, each (N,), at pixels.
 
-    `coefficients` (2, K, 2, K) is the covariance of the coefficients; x and y (N,) are FITS 1-based
-    pixels.
+    `coefficients` (2, K, 2, K) is the covariance of the Legendre coefficients; x and y (N,) are
+    FITS 1-based pixels.
     """
     out = np.empty((3, x.size))
     for rows in point_blocks(x.size):
@@ -489,7 +489,7 @@ class FurtherError:
 
 
 def scaled(rows: Sequence[FurtherError], factor: float) -> tuple[FurtherError, ...]:
-    """Convert rows to another unit."""
+    """Errors with u and v multiplied by `factor`, to convert them to another unit."""
     return tuple(replace(row, u=factor * row.u, v=factor * row.v) for row in rows)
 
 

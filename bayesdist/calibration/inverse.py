@@ -54,7 +54,7 @@ class ExplicitInverse:
         return self.reference_pixel[0] + U + x, self.reference_pixel[1] + V + y
 
     def misses(self, chip: ChipMap) -> tuple[float, float]:
-        """Closure error: largest and rms distance of pixels from the inverse of their positions."""
+        """Closure error: largest and rms distance, in pixels, after the map and this inverse."""
         x, y = detector_grid(chip.basis.size)
         back = self.pixels(*chip.at(x, y))
         far = np.hypot(back[0] - x, back[1] - y)
@@ -132,6 +132,9 @@ def fit_inverse(
 ) -> tuple[dict[tuple[int, int], float], dict[tuple[int, int], float]]:
     """Fit the inverse polynomials P and Q of a map from pixels (x, y) to (U, V).
 
+    `forward` maps FITS 1-based pixels x, y (N,) to U, V (N,) in pixels.  `size` has the columns and
+    rows of the chip, and `order` is the total order of P and Q.
+
     The fit uses orthogonal polynomials over the bounding box of the mapped detector.  The grid
     consists of Chebyshev extrema, which are denser near the edges of the detector; this halves the
     largest error, which occurs in the corners for a uniform grid.
@@ -166,7 +169,11 @@ def detector_grid(
 
 
 def check_one_to_one(U: Float, V: Float, nodes: int, areas: Float | None = None) -> None:
-    """Raise InputError if a map is folded, that is, if any cell of the grid changes its parity."""
+    """Raise InputError if a map is folded, that is, if a cell of the grid changes its parity.
+
+    U and V (nodes^2,) are positions on a regular grid; `areas` are the signed areas of its cells
+    (default: computed from U and V).
+    """
     if areas is None:
         u, v = U.reshape(nodes, nodes), V.reshape(nodes, nodes)
         du_x, dv_x = u[:-1, 1:] - u[:-1, :-1], v[:-1, 1:] - v[:-1, :-1]

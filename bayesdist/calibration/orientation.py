@@ -346,10 +346,11 @@ def departure_from_tangent_plane(
 def refuse_wide_planes(
     calibration: Calibration, epoch: float | None, scale_arcsec: float | None, *, where: str
 ) -> None:
-    """Raise InputError if u, v have no position on the sky and the choice of TAN matters.
+    """Raise InputError for a wide field if the plane (u, v) has no position on the sky.
 
-    `epoch` and `scale_arcsec` are those of `departure_from_tangent_plane`; `where` is the section
-    of the configuration, for the message.
+    In a wide field the choice of a tangent plane (TAN) matters.  `epoch` and `scale_arcsec` are
+    those of `departure_from_tangent_plane`; `where` is the section of the configuration, for the
+    message.
     """
     if calibration.plane.point is not None or calibration.plane.kind == "aperture":
         return

@@ -51,7 +51,11 @@ class CalibrationPrior:
         return self.frame not in ("none", "shift")
 
     def loose(self) -> GaussianPriors:
-        """Priors for a first fit that determines the frame; with a rotation, scale is also free."""
+        """Priors for a first fit, which determines the frame.
+
+        They are flat along the frame with an additional scale, unless the frame has no linear
+        terms.
+        """
         flat_frame = self.frame if self.frame == "affine" else SCALED
         return (replace(self, frame=flat_frame) if self.turns else self)._priors(np.eye(2))
 

@@ -266,7 +266,10 @@ def shared_covariance(calibration: Calibration) -> Float:
 
 
 def local_correlation(row: FurtherError, x: Float, y: Float, chip: Int) -> Float:
-    """Correlations (N, N) of a local error between stars; 0 between chips and on the diagonal."""
+    """Correlations (N, N) of a local error between stars; 0 between chips and on the diagonal.
+
+    x and y (N,) are pixels, and `chip` (N,) has the chip number of each star.
+    """
     at = np.column_stack([x, y])
     separation = np.linalg.norm(at[:, None] - at, axis=2)
     out = np.where(chip[:, None] == chip, correlation_at(separation, row.correlation), 0.0)
@@ -277,7 +280,11 @@ def local_correlation(row: FurtherError, x: Float, y: Float, chip: Int) -> Float
 def own_covariances(
     calibration: Calibration, slope: Float, centroids: tuple[ArrayLike, ArrayLike] | None
 ) -> Float:
-    """Covariances (N, 2, 2) of (u, v) of each star: local, random and centroid errors."""
+    """Covariances (N, 2, 2) of (u, v) of each star: local, random and centroid errors.
+
+    `slope` (N, 2, 2) are the derivatives of (u, v) with respect to the pixels, and `centroids` the
+    standard deviations of x and y in pixels.
+    """
     not_shared = [row for row in calibration.further if not row.shared]
     out = np.zeros(slope.shape)
     out[:, 0, 0] = sum(row.u**2 for row in not_shared)
@@ -291,7 +298,7 @@ def own_covariances(
 
 
 def coefficient_covariance(calibration: Calibration, epoch: float | None) -> Float:
-    """Covariance of the coefficients of all chips; zero if no errors are known."""
+    """Covariance (n, n) of the n coefficients of all chips; zero if no errors are known."""
     cov = calibration.joint_covariance(calibration.numbers, epoch, origin="stated")
     n = 2 * calibration.model.n_terms * len(calibration.numbers)
     return np.zeros((n, n)) if cov is None else cov

@@ -88,7 +88,7 @@ def table_on_sky(
 
 
 def errors_in(calibration: Calibration, centroids: Sequence[str] | None) -> list[tuple[str, str]]:
-    """Errors of sky positions: (name, correlation between stars in words) of each."""
+    """Errors included in the sky positions, as pairs (name, correlation between stars in words)."""
     out = []
     if calibration.errors == "covariance":
         out.append(("coefficients, with their covariance", "correlated between stars"))
@@ -161,7 +161,7 @@ def pixel_columns(
 
 
 def usual_pixel_names(names: Sequence[str], where: str) -> tuple[str, str]:
-    """Names of the pixel columns among the usual ones; ("x", "y") if there are none."""
+    """Names of the columns with x and y that are recognised in `names`; default ("x", "y")."""
     usual = {key: ALIASES[key] for key in ("x", "y")}
     column_of = find_columns(names, None, usual, source=where, pairs=(("x", "y"),))
     return (column_of["x"], column_of["y"]) if len(column_of) == 2 else ("x", "y")
@@ -173,7 +173,8 @@ def chip_numbers(
     """Chip number (N,) of each row, from an option or a column.
 
     `known` are the chip numbers of the calibration; `name` and `where` are the names of the
-    calibration and of the table for messages.
+    calibration and of the table for messages.  Raises InputError if a chip is unknown, or the
+    column is needed but missing.
     """
     listed = ", ".join(map(str, known))
     if chip is not None:

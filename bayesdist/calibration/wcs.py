@@ -184,7 +184,7 @@ class CalibrationWCS(BaseLowLevelWCS, HighLevelWCSMixin):
 
     @property
     def world_axis_object_components(self) -> list[tuple[str, int, str]]:
-        """Object, argument and attribute of each world axis."""
+        """Components (object, argument, attribute) of the world coordinates; see APE 14."""
         if self.placement is None:
             return [("u", 0, "value"), ("v", 0, "value")]
         return [
