@@ -20,7 +20,10 @@ def even_edges(n: int, most: int) -> list[int]:
 
 
 def every_kth(n_rows: int, n: int) -> int:
-    """Smallest k for which every k-th of `n_rows` rows gives a sample of at most n rows."""
+    """Smallest k for which every k-th of `n_rows` rows gives a sample of at most n rows.
+
+    Raises InputError if n is less than one.
+    """
     if n < 1:
         raise InputError(f"a sample of {n} rows is asked for", do="ask for at least one")
     return max(1, -(-n_rows // n))

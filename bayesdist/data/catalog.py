@@ -254,7 +254,7 @@ class ReferenceCatalog:
         )
 
     def mirrored(self) -> ReferenceCatalog:
-        """Catalogue with the sign of u reversed, and therefore without a tangent point."""
+        """Catalogue with the sign of u reversed; tangent point and parallaxes are removed."""
         return replace(
             self,
             u=-self.u,

@@ -1,10 +1,7 @@
-"""Columns and labels of matches: default values, checks, and concatenation.
+"""Columns and labels of matches as plain arrays in one unit, with checks and concatenation.
 
-Labels of matches: names of codes, unit, counts and notes.
-
-Columns of matches as plain arrays of equal length in one unit, and checks of their values.
-
-Concatenation of tables of matches: codes are renumbered, counts added, and columns checked.
+Labels are the names of codes, the unit, counts and notes.  When tables are concatenated, codes are
+renumbered, counts are added, and columns are checked.
 """
 
 from __future__ import annotations
@@ -76,7 +73,7 @@ class Labels:
     def codes(self, key: str, block: Mapping[str, Any], *, source: str) -> Int:
         """Codes of a block's exposures, chips or filters, converted to the labels of all files.
 
-        InputError for a label that did not exist when the files were scanned.
+        Raises InputError for a label that did not exist when the files were scanned.
         """
         code_by_label = self._numbers[key]
         labels = block[LABELS_OF_CODES[key]]
@@ -98,7 +95,11 @@ class Labels:
 
 
 def recoded(key: str, block: Mapping[str, Any], code_of_label: Int) -> Int:
-    """Codes (N,) of a block, converted with the new code of each of its labels."""
+    """New codes (N,) of the rows of a block.
+
+    `key` is 'exposure', 'chip' or 'filter'; `code_of_label` has the new code of each label of the
+    block.
+    """
     codes = block.get(key)
     if codes is None:
         codes = np.zeros(len(block["x"]), np.int64)
@@ -332,7 +333,10 @@ def _check(
 
 
 def refuse_repeated(columns: Columns, *, place: Callable[[int], str]) -> None:
-    """Raise InputError if the same measurement of a star occurs twice."""
+    """Raise InputError if the same measurement of a star occurs twice.
+
+    `place` returns the location of a row, given its index, for the message.
+    """
     names = (*POSITIONS, *LABELS_OF_CODES, "epoch")
     pair = first_duplicate([columns[name] for name in names if name in columns])
     if pair is not None:
@@ -347,7 +351,8 @@ def refuse_repeated(columns: Columns, *, place: Callable[[int], str]) -> None:
 def joined_arguments(tables: Sequence[MatchColumns]) -> dict[str, Any]:
     """Arguments of `Matches` for the rows of several tables in their order.
 
-    InputError if units or tangent points differ, or if only some tables have an optional column.
+    Raises InputError if units or tangent points differ, or if only some tables have an optional
+    column.
     """
     first = tables[0]
     for table in tables[1:]:
@@ -424,7 +429,10 @@ def merged_codes(
 
 
 def common_radius(radii: Sequence[float | None], sources: Sequence[str]) -> float | None:
-    """Match radius of all tables; None if any has none. InputError if they differ."""
+    """Match radius common to all tables; None if a table has none.
+
+    Raises InputError if the radii differ; `sources` are the names of the tables for the message.
+    """
     stated = {radius for radius in radii if radius is not None}
     if len(stated) == 0 or None in radii:
         return None
@@ -440,7 +448,10 @@ def common_radius(radii: Sequence[float | None], sources: Sequence[str]) -> floa
 def merged_optional(
     name: str, arrays: Sequence[Float | None], sources: Sequence[str]
 ) -> Float | None:
-    """Concatenated column; None if no table has it. InputError if only some have it."""
+    """Concatenated column; None if no table has it.
+
+    Raises InputError if only some tables have it; `sources` are the names of the tables.
+    """
     present = [a for a in arrays if a is not None]
     if not present:
         return None

@@ -105,7 +105,7 @@ class Detections:
 
     @property
     def points(self) -> Float:
-        """Positions (N, 2)."""
+        """Positions (N, 2) of the detections, in pixels."""
         return np.column_stack([self.x, self.y])
 
     @property
@@ -144,7 +144,7 @@ def detections_of(
     """Combine lists of one exposure each; `epoch` (E,) is in decimal years.
 
     `sigma` is an error in pixels common to all detections. Without it, errors are those of the
-    lists if all lists have errors. InputError if only some of the lists have magnitudes.
+    lists if all lists have errors. Raises InputError if only some of the lists have magnitudes.
     """
     with_mag = [stars.mag is not None for stars in lists]
     if any(with_mag) and not all(with_mag):

@@ -71,9 +71,10 @@ class MagnitudeErrors:
         return u, v
 
     def less(self, sigma_u: ArrayLike, sigma_v: ArrayLike) -> MagnitudeErrors:
-        """Subtract other errors in quadrature, common to all magnitudes or one per bin (B,).
+        """Subtract other errors in quadrature.
 
-        At least a quarter of each error remains, because the other errors are not known precisely.
+        `sigma_u` and `sigma_v` are common to all magnitudes, or one per bin (B,).  At least a
+        quarter of each error remains, because the other errors are not known precisely.
         """
         remaining_u, remaining_v = (
             np.sqrt(np.maximum(sigma**2 - np.square(other_sigma), (_LEAST_LEFT * sigma) ** 2))
@@ -94,7 +95,7 @@ def no_magnitudes(where: str) -> InputError:
 def estimate(
     mag: ArrayLike, residual_u: ArrayLike, residual_v: ArrayLike, *, n_params: int = 0
 ) -> MagnitudeErrors:
-    """Robust scatter of residuals (N,) in bins of magnitude, smoothed.
+    """Standard errors by magnitude: smoothed robust scatter of residuals (N,) in magnitude bins.
 
     The scatter of a bin is 1.4826 times the median absolute residual of the stars within 4 sigma on
     both axes. It is taken about zero, because an offset common to the stars of one magnitude is
@@ -103,8 +104,8 @@ def estimate(
     / sigma^2. Bins hold nearly equal numbers of stars. The smoothed curve increases towards faint
     stars, and towards the brightest (saturated) stars if the data require it.
 
-    InputError if values are not finite, if there are fewer than 10 stars, if there are not more
-    residuals than parameters, or if a bin has no scatter.
+    Raises InputError if values are not finite, if there are fewer than 10 stars, if there are not
+    more residuals than parameters, or if a bin has no scatter.
     """
     mag = np.asarray(mag, float)
     residuals = np.stack([np.asarray(residual_u, float), np.asarray(residual_v, float)])
@@ -228,9 +229,10 @@ class AddedErrors:
     other: Float  # (2,), for stars with another label, such as a held-out exposure
 
     def at(self, labels: Sequence[str], codes: Int) -> tuple[Float, Float]:
-        """Errors (N,) of u and v of stars; `codes` (N,) are indices into `labels` of their groups.
+        """Errors (N,) of u and of v, to be added in quadrature to those of stars.
 
-        `Matches.grouped` returns both.
+        `codes` (N,) are the indices into `labels` of the stars' groups; `Matches.grouped` returns
+        both.
         """
         row = {label: k for k, label in enumerate(self.labels)}
         of_label = np.array([row.get(label, len(row)) for label in labels], np.int64)

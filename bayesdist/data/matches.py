@@ -158,6 +158,8 @@ class Matches(MatchColumns):
         ------
         InputError
             As for the constructor, except for repeated stars.
+        TypeError
+            If an argument is unknown, or a position is missing.
         """
         arguments = [argument for argument in fields(cls) if argument.init]
         defaults = {

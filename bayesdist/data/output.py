@@ -59,8 +59,8 @@ def geometry_header(matches: MatchColumns) -> dict[str, Any]:
 def header_arguments(header: Mapping[str, Any], unit: str, *, source: str) -> dict[str, Any]:
     """Arguments of `Matches` from the header of a table that has a `geometry_header`.
 
-    `unit` is that of u and v, to which the match radius is converted. Empty for a table written by
-    another program.
+    `unit` is that of u and v, to which the match radius is converted.  The result is empty for a
+    table written by another program.
     """
     stated = header.get(HEADER)
     if not isinstance(stated, Mapping):

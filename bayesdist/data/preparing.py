@@ -36,7 +36,10 @@ HELD_OUT = "held out"  # reason under which held-out rows are counted
 
 @dataclass(frozen=True, eq=False)
 class MotionErrorLine:
-    """Largest proper-motion error that counts as well measured, as a function of magnitude."""
+    """Largest proper-motion error that counts as well measured, as a function of magnitude.
+
+    Arrays (B,) have the magnitudes, and the errors in the catalogue's unit per year.
+    """
 
     # mag, sigma (B,): knots in ascending magnitude; log-linear between them, constant beyond
     mag: Float
@@ -48,7 +51,7 @@ class MotionErrorLine:
 
 
 def motion_error_line(catalog: ReferenceCatalog) -> MotionErrorLine:
-    """Line in magnitude and proper-motion error above which stars are badly measured.
+    """Limit on the proper-motion error by magnitude; stars above it are badly measured.
 
     In magnitude bins of about 200 stars (at most 40 bins), the line is the median of the error
     times exp(2.5 s), where s is the robust scatter (1.4826 median absolute deviation) of its
@@ -229,7 +232,10 @@ class HoldoutSplit:
 
 
 def exposures_drawn(names: Sequence[str], n: int, seed: int) -> tuple[str, ...]:
-    """Names of `n` exposures drawn with a seed; InputError unless fewer than all are drawn."""
+    """Names of `n` exposures drawn with a seed, in the order of `names`.
+
+    Raises InputError unless fewer exposures are drawn than there are.
+    """
     if n >= len(names):
         raise InputError(
             f"{n} exposures are to be held out, and there are {len(names)}",
@@ -242,9 +248,9 @@ def exposures_drawn(names: Sequence[str], n: int, seed: int) -> tuple[str, ...]:
 
 
 def split_matches(matches: Matches, aside: HoldoutSpec) -> HoldoutSplit:
-    """Split matches into two parts; matches on disk are read once.
+    """Split matches into those to fit and those to hold out; matches on disk are read once.
 
-    InputError for an unknown exposure, or if either part would be empty.
+    Raises InputError for an unknown exposure, or if either part would be empty.
     """
     location = ", ".join(matches.sources)
     refuse_strangers(aside.exposures, matches.exposure_names, location)

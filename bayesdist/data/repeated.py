@@ -65,9 +65,10 @@ def check_same_position(value: str) -> None:
 
 
 def position_codes(first: Float, second: Float) -> Int:
-    """Code (N,) of the distinct position of each row; positions within rounding are equal.
+    """Code (N,) of the distinct position of each row; equal within rounding counts as equal.
 
-    Codes count from 0 in ascending order of the positions, independent of the order of the rows.
+    `first` and `second` (N,) are the two coordinates.  Codes count from 0 in ascending order of the
+    positions, independent of the order of the rows.
     """
     # -0.0 and 0.0 are equal
     distinct, code = np.unique((first + 0.0) + 1j * (second + 0.0), return_inverse=True)
@@ -81,10 +82,11 @@ def position_codes(first: Float, second: Float) -> Int:
 
 
 def star_codes(first: Float, second: Float, same_position: str) -> tuple[Int | None, str]:
-    """Codes (N,) of stars by their reference positions, and a note about them.
+    """Codes (N,) of stars from their reference positions, and a note about them.
 
-    None and an empty note if no position occurs twice. With "separate_stars" each row gets a
-    different code, so that equal positions are not searched for again.
+    They are None and an empty note if no position occurs twice.  `same_position` is the option of
+    `ReadOptions`.  With 'separate_stars' each row gets a different code, so that equal positions
+    are not searched for again.
     """
     code = position_codes(first, second)
     number = np.bincount(code)
@@ -222,7 +224,7 @@ def tight_groups(u: Float, v: Float, star: Int | None = None) -> TightGroups | N
 def error_codes(u: Float, v: Float, star: Int | None) -> Int | None:
     """Code (N,) of the star, or tight group of stars, that shares a reference error.
 
-    None if each row is a separate star.
+    The result is None if each row is a separate star.
     """
     groups = tight_groups(u, v, star)
     return star if groups is None else groups.code
@@ -285,7 +287,7 @@ def first_repetition(
     Each batch is a sequence of keys as for `first_duplicate`. A fraction 1 / `buckets` of the
     hashes is in memory at a time. `hashing` returns an integer per row. `at_once` is the number of
     repeated hashes for which rows are compared in full at a time: the pair is the earliest one
-    among the first of them. InputError if the scratch folder is full.
+    among the first of them. Raises InputError if the scratch folder is full.
     """
     waiting: list[UInt] = []
     for k, hashes in enumerate(_bucketed(batches, buckets, hashing)):

@@ -63,7 +63,10 @@ class ReferenceSky:
 
 
 def sky_columns(quantities: Quantities) -> tuple[Float, Float]:
-    """Right ascension and declination (N,) of the rows of a table, converted to degrees."""
+    """Right ascension and declination (N,) of the rows of a table, converted to degrees.
+
+    Raises InputError if a declination is beyond 90 degrees.
+    """
     ra, dec = (_degrees(quantities[key], key) for key in ("ra", "dec"))
     beyond = np.abs(dec) > 90.0
     if beyond.any():
@@ -107,7 +110,8 @@ def reference_sky(
     `epoch` (N,) is that of the exposures, `catalogue_epoch` that of the positions if there is no
     such column. Besides ra and dec, these columns are used if they exist: sigma_ra, sigma_dec,
     pm_ra, pm_dec and their errors, corr_ra and corr_dec (correlation of position and motion on one
-    axis), parallax and its error. InputError for half a pair, and for missing or invalid units.
+    axis), parallax and its error. Raises InputError for half a pair, and for missing or invalid
+    units.
     """
     ra, dec = sky_columns(quantities)
     sigma = _pair(quantities, ("sigma_ra", "sigma_dec"), "arcsec")
@@ -351,7 +355,10 @@ def _exact_sum(values: Float) -> int:
 
 
 def direction_of(vector: tuple[int, int, int]) -> tuple[float, float]:
-    """Direction of a vector of any length, in the form returned by `mean_direction`."""
+    """Right ascension and declination in degrees of a vector of any length.
+
+    See `mean_direction`.
+    """
     x, y, z = (float(component) for component in vector)
     ra0 = float(np.degrees(np.arctan2(y, x)) % 360.0)
     return ra0, float(np.degrees(np.arctan2(z, np.hypot(x, y))))
@@ -450,11 +457,12 @@ def onto_plane(
     where: str = "",
     place: Place = row_number,
 ) -> dict[str, Any]:
-    """Columns u, v, tangent_point of stars in arcsec, and sigma_u, pm_u, sigma_pm_u if given.
+    """Arguments of `Matches` for stars on a tangent plane, in arcsec.
 
-    `ra`, `dec` (N,) and `point` are in degrees; the default point is the mean direction. Errors,
-    motions and their errors (2, N) are to the east (with the factor cos(dec)) and to the north, in
-    arcsec (per year).
+    They are u, v and tangent_point, and the columns sigma, pm and sigma_pm for u and v if these are
+    given.  `ra`, `dec` (N,) and `point` are in degrees; the default point is the mean direction.
+    Errors, motions and their errors (2, N) are to the east (with the factor cos(dec)) and to the
+    north, in arcsec (per year).
     """
     point = mean_direction(ra, dec) if point is None else point
     u, v = tangent_plane(ra, dec, point, where=where, place=place)
@@ -500,7 +508,10 @@ def separation(point: tuple[ArrayLike, ArrayLike], ra: ArrayLike, dec: ArrayLike
 
 
 def sky_of_plane(xi: ArrayLike, eta: ArrayLike, point: tuple[float, float]) -> tuple[Float, Float]:
-    """Right ascension in [0, 360) and declination, degrees, of points (arcsec) on a plane."""
+    """Right ascension in [0, 360) and declination, in degrees, of positions on a tangent plane.
+
+    `xi` and `eta` are in arcsec, and the tangent point `point` in degrees.
+    """
     xi, eta = np.asarray(xi, float) / ARCSEC, np.asarray(eta, float) / ARCSEC
     x, y, z = np.moveaxis(np.stack([xi, eta, np.ones_like(xi)], axis=-1) @ plane_axes(point), -1, 0)
     return np.degrees(np.arctan2(y, x)) % 360.0, np.degrees(np.arctan2(z, np.hypot(x, y)))

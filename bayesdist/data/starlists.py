@@ -43,12 +43,17 @@ class StarCuts:
     Parameters
     ----------
     mag : tuple of float, optional
-        Brightest and faintest instrumental magnitude. For star lists of
-        the HST, (-14, -10) typically selects the well measured stars.
+        Brightest and faintest instrumental magnitude. For star lists of HST, (-14, -10) typically
+        selects the well measured stars.
     saturation : float, optional
         Magnitude limit; brighter stars are saturated.
     q_max : float, optional
         Largest (poorest) quality parameter of the PSF fit.
+
+    Raises
+    ------
+    InputError
+        If the range of magnitudes is empty.
     """
 
     mag: tuple[float, float] | None = None

@@ -89,7 +89,7 @@ class StoredRows:
     def load(self) -> Matches:
         """Read the rows, with codes and sources that refer to the labels.
 
-        InputError if a file is damaged, missing, or has changed since it was opened.
+        Raises InputError if a file is damaged, missing, or has changed since it was opened.
         """
         columns: dict[str, NDArray[Any]] = {}
         names, end = set(COLUMNS), 0
@@ -125,7 +125,8 @@ def open_matches(path: PathLike | Sequence[PathLike], **options: Unpack[ReadArgu
     path : path-like or sequence of path-like
         Parquet: a file, a list of files, a pattern, or a folder of parts of one table.
     **options
-        As for `ReadOptions`; rows with missing values or values that are not finite are an error.
+        Fields of `ReadOptions` by name; rows with missing values or values that are not finite are
+        an error.
 
     Returns
     -------
@@ -135,8 +136,8 @@ def open_matches(path: PathLike | Sequence[PathLike], **options: Unpack[ReadArgu
     Raises
     ------
     InputError
-        If a file or an option is invalid; the message says what to change. All files must have the
-        same quantities, and some of them may be empty.
+        If a file or an option is invalid, or the files have different quantities; the message says
+        what to change. Some of the files may be empty.
 
     Examples
     --------
@@ -293,10 +294,10 @@ class StoredFile:
         stop: int | None = None,
         size: int,
     ) -> Iterator[dict[str, Any]]:
-        """Arguments of Matches for rows `start` to `stop`, at most `size` rows at a time.
+        """Arguments of `Matches` for rows `start` to `stop`, at most `size` rows at a time.
 
-        As from `match_columns`, with codes that refer to labels of the block. InputError for an
-        invalid row names its row group.
+        They are those of `match_columns`, with codes that refer to labels of the block.  The
+        InputError for an invalid row names its row group.
         """
         column_names = self.found
         encoded = {column_names[key] for key in LABELS_OF_CODES if key in column_names}
@@ -315,7 +316,7 @@ class StoredFile:
             yield out
 
     def direction(self) -> tuple[int, int, int]:
-        """Sum of the direction vectors of all reference positions."""
+        """Sum of the unit vectors of all reference positions, in the form of `direction_sum`."""
         total = np.zeros(3, object)
         columns = [self.found["ra"], self.found["dec"]]
         for block in self.part.blocks(columns, size=BLOCK):
@@ -334,7 +335,11 @@ def stored_file(
     *,
     exposure_name: str | None,
 ) -> StoredFile:
-    """Layout of a file from the names and units of its columns; InputError if one is missing."""
+    """Layout of a file from the names and units of its columns.
+
+    Raises InputError if a needed column is missing.  `exposure_name` is the name of the single
+    exposure, if the file has no column of exposures.
+    """
     source = part.name
     column_names, options, notes = columns_read(part.colnames, {}, options, source=source)
     column_names.pop("flux", None)  # magnitudes would require the fluxes of all rows to be positive
@@ -354,7 +359,7 @@ def stored_file(
 
 
 def tangent_point_of(parts: Sequence[StoredFile]) -> tuple[float, float]:
-    """Mean direction of all reference positions."""
+    """Tangent point: mean direction (RA, Dec), in degrees, of all reference positions."""
     total = np.zeros(3, object)
     for part in parts:
         total += part.direction()
@@ -393,9 +398,10 @@ class _LabelScan:
 
 
 def scan(parts: Sequence[StoredFile]) -> Labels:
-    """Labels common to all parts, from a scan of all rows; InputError for invalid or repeated rows.
+    """Labels common to all parts, from a scan of all rows.
 
-    The parts must have the same quantities and unit, and a tangent point if they need one.
+    Raises InputError if a row is invalid or repeated.  The parts must have the same quantities and
+    unit, and a tangent point if they need one.
     """
     n_rows = sum(part.part.n_rows for part in parts)
     if n_rows == 0:

@@ -131,7 +131,10 @@ def _expanded(path: Path) -> list[Path]:
 
 
 def kind_of(file: Path, columns: Mapping[str, str] | None) -> str:
-    """Format of a file: one registered by a mission, or else by its name and then its content."""
+    """Format of a file: one registered by a mission, otherwise by its name and then its content.
+
+    Raises FormatError if the format is not recognised.
+    """
     formats = mission_formats()
     if columns is None and file.is_file():
         for key, format_ in formats.items():
@@ -199,10 +202,11 @@ def table_layout(
     *,
     read_sigma: bool = True,
 ) -> TableLayout | None:
-    """Layout of a file of matches, or of the first of several; None for files with fixed columns.
+    """Layout of a file of matches; None for a format with fixed columns.
 
-    Arguments and errors are as for `read_matches`, except that columns may be missing. `read_sigma`
-    is True if columns of errors are read.
+    If `path` has several files, the first one is described.  Arguments and errors are as for
+    `read_matches`, except that columns may be missing.  `read_sigma` is True if columns of errors
+    are read.
     """
     file = input_files(path)[0]
     if kind_of(file, columns) != "table":

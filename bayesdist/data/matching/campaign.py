@@ -74,7 +74,10 @@ class CampaignMatches:
         return match_warnings(self.reports, self.left_out, log)
 
     def summary(self) -> Table:
-        """Reports as a table with one row per exposure, and columns for chips and reasons."""
+        """Reports as a table with one row per exposure.
+
+        It has a column for each chip, and one for each reason for which detections were rejected.
+        """
         chips = sorted({chip for report in self.reports for chip in report.per_chip})
         reasons = list(
             dict.fromkeys(reason for report in self.reports for reason in report.rejected)

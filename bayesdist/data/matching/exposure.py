@@ -230,12 +230,12 @@ def iterated_pairs(
 ) -> Pairs | None:
     """Pairs of positions `start` (N, 2) with `reference` (M, 2), after fitting a cubic per chip.
 
-    `rho` (N,) are distances from the middle of the detections, `tree` is the k-d tree of
-    `reference`, and `largest` is the largest distance of a pair. None if there are no more pairs
-    than by chance.
+    `chip` (N,) are chip numbers, `rho` (N,) are distances from the middle of the detections, `tree`
+    is the k-d tree of `reference`, and `largest` is the largest distance of a pair.  The result is
+    None if there are no more pairs than by chance.
 
-    While the cubics bring in more pairs, the radius stays at its largest value. It then shrinks to
-    the radius that the pairs need, unless it is fixed, and the cubics are fitted once more.
+    While the cubics bring in more pairs, the radius stays at its largest value.  It then shrinks to
+    the radius that the pairs need, unless `fixed` is True, and the cubics are fitted once more.
     """
     allowed = SearchRadius(np.zeros(1), np.array([largest]))
     chance = min(chance_rate(start, tree, largest, _DISPLACEMENT * largest), 0.99)
@@ -360,9 +360,10 @@ class SearchRadius:
     Parameters
     ----------
     rho : ndarray, shape (R,)
-        Median distance of the pairs in each ring from the centre, ascending.
+        Median distance of the pairs in each ring from the centre, ascending, in the unit of the
+        positions.
     radius : ndarray, shape (R,)
-        Largest distance of a pair in each ring.
+        Largest distance of a pair in each ring, in the same unit.
     """
 
     rho: Float

@@ -70,11 +70,11 @@ def mutual_frames(
     *,
     source: str = "star lists",
 ) -> MutualFrames:
-    """Maps of all exposures onto the first one.
+    """Linear maps of all exposures onto the plane of the first one.
 
-    `planes` (N_e, 2) are the positions in each exposure after the known distortion. With `mags`,
-    only bright stars are used. InputError if the exposures form several groups without common
-    stars; the message lists the groups.
+    `planes` has the positions (N_e, 2) in each exposure after the known distortion.  If magnitudes
+    `mags` are given, only bright stars are used.  Raises InputError if the exposures form several
+    groups without common stars; the message lists the groups.
     """
     groups = _groups(planes, mags)
     if len(groups) > 1:
@@ -97,7 +97,10 @@ def mutual_frames(
 def refuse_duplicates(
     pixels: Sequence[Float], names: Sequence[str], *, source: str = "star lists"
 ) -> None:
-    """Raise InputError if an exposure has two names; `pixels` (N_e, 2) are raw positions."""
+    """Raise InputError if two exposures have the same detections.
+
+    `pixels` has the raw positions (N_e, 2) of each exposure.
+    """
     rows = [{tuple(row) for row in np.round(positions, 6).tolist()} for positions in pixels]
     for b in range(len(rows)):
         for a in range(b):
@@ -193,7 +196,7 @@ class Cell:
 
 @dataclass(frozen=True, eq=False)
 class Grouped:
-    """Groups with their first detection in a cell."""
+    """Groups of a cell, each of which has its first detection in that cell."""
 
     rows: Int  # (m,) rows of detections that belong to stars
     first: Int  # (m,) first row of the star of each detection
@@ -206,11 +209,12 @@ class Grouped:
 def friends_of_friends(
     places: Float, exposure: Int, length: float, *, each: Each = map, per_cell: int | None = None
 ) -> Friends:
-    """Groups of detections (N, 2) that are connected by steps of at most one linking length.
+    """Stars: groups of detections (N, 2) connected by steps of at most one linking length.
 
+    `length` is the linking length, in the unit of `places`, and `exposure` (N,) are exposure codes.
     Distances are exact to a sixteenth of the linking length: positions are rounded to a grid, which
-    reduces the many detections of a star to a few points. Star codes are in the order of the first
-    detections. `each` applies a function to the cells, by default one after another in this
+    reduces the many detections of a star to a few points.  Star codes are in the order of the first
+    detections.  `each` applies a function to the cells, by default one after another in this
     process. `per_cell` is the average number of detections per cell (default: `CELL`); the result
     does not depend on it.
     """
@@ -271,7 +275,7 @@ def _within(square: Int, low: Int, high: Int) -> Bool:
 
 
 def grouped(cell: Cell) -> Grouped:
-    """Groups of a cell."""
+    """Groups of detections in a cell that are connected by the linking length."""
     places, rows = cell.places, cell.rows
     column, line = _squares(places, cell.length)
     key = column * (line.max() + np.int64(1)) + line

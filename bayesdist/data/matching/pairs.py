@@ -36,9 +36,9 @@ _MAX_PAIRS_FITTED = 4000  # largest number of pairs in a fit; more pairs hardly 
 
 
 def hull_of(points: Float) -> tuple[Float, float]:
-    """Half-planes a x + b y + c <= 0 around points (N, 2) as rows (K, 3), and the enclosed area.
+    """Convex hull of points (N, 2): half-planes a x + b y + c <= 0 as rows (K, 3), and its area.
 
-    Points without a convex hull get their bounding box. The area is always positive.
+    Points without a convex hull get their bounding box.  The area is always positive.
     """
     try:
         hull = ConvexHull(points)
@@ -55,7 +55,7 @@ def hull_of(points: Float) -> tuple[Float, float]:
 
 
 def inside_hull(points: Float, equations: Float) -> Bool:
-    """Boolean mask of the points (N, 2) inside a hull."""
+    """Boolean mask (N,) that is True for points (N, 2) inside a hull, given by its half-planes."""
     inside = np.ones(len(points), bool)
     for a, b, c in equations:
         inside &= points @ np.array([a, b]) + c <= 0
@@ -144,11 +144,11 @@ def are_enough(n: int, n_points: int, n_reference: int) -> bool:
 
 
 def beats_chance(points: Float, reference: Float, tree: cKDTree, distance: Float) -> bool:
-    """True if there are true pairs: displaced detections find far fewer neighbours.
+    """True if there are true pairs, that is, if displaced detections find far fewer neighbours.
 
     Two dense clusters on top of each other give many pairs, but equally many after a small
-    displacement. `distance` are the distances of the pairs, `tree` is the k-d tree of the reference
-    positions.
+    displacement.  `distance` (n,) has the distances of the pairs, and `tree` is the k-d tree of the
+    reference positions.
     """
     reach = max(float(np.median(distance)), 1e-9 * float(np.abs(reference).max()))
     sample = points[:: -(-len(points) // MAX_SAMPLE)]
@@ -200,12 +200,12 @@ def best_similarity(points: Float, reference: Float) -> LinearMap:
 def iterated_map(
     points: Float, reference: Float, tree: cKDTree, start: LinearMap, reach: float, radius: float
 ) -> LinearMap | None:
-    """Linear map fitted in rounds, with pairs within `reach` at first and within `radius` at last.
+    """Linear map from points (N, 2) to their counterparts in `reference` (M, 2), by iteration.
 
-    In each round the area grows outwards from the origin of `start`. Far from the position at which
-    the offset was found, a small rotation displaces stars by more than their spacing, so the map is
-    first fitted near that position. `tree` is the k-d tree of `reference` (M, 2). None if there are
-    too few pairs, or if they are on a line.
+    Pairs are within `reach` at first and within `radius` at last.  In each round the area grows
+    outwards from the origin of `start`: far from the position at which the offset was found, a
+    small rotation displaces stars by more than their spacing.  `tree` is the k-d tree of
+    `reference`.  The result is None if there are too few pairs, or if they are on a line.
     """
     outwards = np.argsort(((points - start.origin) ** 2).sum(axis=1))
     current, size, reach = start, _FIRST_SAMPLE, max(reach, radius)
@@ -241,11 +241,11 @@ def robust_fit(
     slack: float = 0.0,
     reach: float = np.inf,
 ) -> RobustFit[Solution] | None:
-    """Fit N pairs repeatedly, without those beyond three median distances, until none changes.
+    """Fit N pairs repeatedly, rejecting pairs beyond three median distances, until none changes.
 
     `fit` takes a mask (N,) of pairs and returns the solution and the distances (N,) of all pairs
-    from it, or None if the pairs do not determine it. The result is None if that happens or if
-    there are fewer than `least` pairs. `slack` is the rounding error of a distance of zero; pairs
+    from it, or None if the pairs do not determine it.  The result is None in that case, and if
+    there are fewer than `least` pairs.  `slack` is the rounding error of a distance of zero; pairs
     beyond `reach` are not used.
     """
     robust, use = None, np.ones(n, bool)

@@ -100,10 +100,10 @@ class ExposureReport:
 def check_campaign(
     lists: Sequence[Detections], log: ExposureLog, catalog: ReferenceCatalog
 ) -> None:
-    """Raise InputError if lists, log and catalogue do not fit together.
+    """Raise InputError if the lists, the log and the catalogue are inconsistent.
 
-    InputError if there are no lists, if an exposure is not in the log or occurs in two lists, if
-    errors are 0, or if there are proper motions without an epoch.
+    This is the case if there are no lists, if an exposure is not in the log or occurs in two lists,
+    if errors are 0, or if there are proper motions without an epoch.
     """
     if not lists:
         raise InputError("there are no star lists to match", do="give at least one")
@@ -152,10 +152,10 @@ def too_many(failed: int, matched: int, n: int) -> bool:
 def failure(
     failed: Mapping[str, InputError], reason: str, n: int, tried: Sequence[bool] = (False,)
 ) -> InputError:
-    """First failure as an error, with a summary of the others.
+    """First failure as an error, with a summary of the other failures among n exposures.
 
-    `failed` holds the errors by exposure and `reason` is that of `mismatch_reason`. `tried` has an
-    entry for each parity that was tried, True for a mirrored catalogue.
+    `failed` has the errors by exposure, and `reason` is the clause from `mismatch_reason`, or
+    empty. `tried` has an entry for each parity that was tried: True for a mirrored catalogue.
     """
     first = next(iter(failed.values()))
     cause, do = first.cause, first.do
@@ -170,7 +170,10 @@ def failure(
 
 
 def refuse_astray(reports: Sequence[ExposureReport], catalog: ReferenceCatalog) -> None:
-    """Raise InputError if distortion or chip numbers misplace a chip in most exposures."""
+    """Raise InputError if a chip does not match in most exposures although another one does.
+
+    The known distortion or the chip numbers are then wrong.
+    """
     astray = [report for report in reports if report.astray]
     if 2 * len(astray) <= len(reports):
         return

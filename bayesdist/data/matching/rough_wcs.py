@@ -473,8 +473,8 @@ def _by_wcs(
 def sky_of_pixels(wcs: Any, x: Float, y: Float) -> tuple[Float, Float]:
     """Right ascension and declination (ICRS, degrees) at 0-based pixels, by any APE 14 WCS.
 
-    NaN where the WCS gives no position. InputError for other objects, and for a WCS that does not
-    map two pixel axes to the sky.
+    NaN where the WCS gives no position. Raises InputError for other objects, and for a WCS that
+    does not map two pixel axes to the sky.
     """
     low = getattr(wcs, "low_level_wcs", wcs)
     if not hasattr(low, "pixel_to_world_values"):

@@ -248,8 +248,8 @@ def grown_map(
 ) -> LinearMap:
     """Linear map of points (N, 2), fitted outwards from the middle, where a similarity is accurate.
 
-    The search radius shrinks from 0.3 to `narrow` mean spacings of the reference stars. If too few
-    points have a pair, the similarity itself is returned.
+    The search radius shrinks from 0.3 to `narrow` mean spacings of the reference stars.  If too few
+    points have a pair, the similarity `found` itself is returned.
     """
     wide, final_reach = _WIDE * reference.spacing, narrow * reference.spacing
     grown = iterated_map(points, reference.positions, reference.tree, found.map, wide, final_reach)

@@ -41,7 +41,7 @@ class Matching:
     index, catalog_index : ndarray of int, shape (n_pairs,)
         Rows of the detections and of the catalogue; no row is repeated.
     transformation : LinearMap
-        Map from the given positions to those of the catalogue.
+        Map from the positions of the detections to those of the catalogue.
     radius : float
         Largest distance of a pair, in the catalogue's unit.
     coincidences : int
@@ -175,8 +175,8 @@ def match_table(
     Parameters
     ----------
     table : Matches
-        Matches with u, v as approximate corrected positions in the catalogue's unit, as given by
-        a program for photometry.
+        Matches with u, v as approximate corrected positions in the catalogue's unit, as measured by
+        a photometry program with a known distortion.
     catalog : ReferenceCatalog
         Catalogue, which is moved to the mean epoch of each exposure if it has proper motions.
     radius, max_offset

@@ -25,9 +25,9 @@ CENTROID_ERRORS = (
 
 
 def position_unit(pair: tuple[SourceColumn, SourceColumn], unit: str | None) -> str:
-    """Unit ('pix', 'arcsec', 'mas', 'deg') of a pair of columns, from the file or the option.
+    """Unit ('pix', 'arcsec', 'mas' or 'deg') of two columns, from the file or the option `unit`.
 
-    InputError if both are missing, or if the file, the option or the two columns disagree.
+    Raises InputError if both are missing, or if the file, the option or the two columns disagree.
     """
     if unit is not None:
         check_unit(unit, where="unit")
@@ -66,10 +66,10 @@ def is_on_sky(
     columns: Mapping[str, str] | None,
     source: str,
 ) -> bool:
-    """True if ra, dec are the reference positions rather than u, v.
+    """True if the reference positions are ra and dec rather than u and v.
 
-    `found` is the column of each quantity, and `columns` are those named by the user. InputError if
-    the user names both ra, dec and u, v.
+    `found` is the column of each quantity, and `columns` are those named by the user.  Raises
+    InputError if the user names both ra, dec and u, v.
     """
     named = {key for key, column in (columns or {}).items() if column}
     plane, sky = named & {"u", "v"}, named & {"ra", "dec"}
@@ -91,7 +91,10 @@ def present_columns(
     source: str,
     read_sigma: bool = True,
 ) -> dict[str, str]:
-    """Column of each quantity that exists: x, y, either u, v or ra, dec, and optional ones."""
+    """Column of each quantity that the table has: x, y, either u, v or ra, dec, and optional ones.
+
+    `columns` are those named by the user; errors are omitted unless `read_sigma` is True.
+    """
     names = list(names)
     present = find_columns(names, columns, ALIASES, source=source, pairs=PAIRS)
     on_sky = is_on_sky(names, present, columns, source)
@@ -119,7 +122,10 @@ def needed_columns(
     source: str,
     read_sigma: bool = True,
 ) -> dict[str, str]:
-    """Column of each quantity as in `present_columns`; InputError if a needed one is missing."""
+    """Column of each quantity as in `present_columns`.
+
+    Raises InputError if a needed column is missing.
+    """
     names = list(names)
     present = present_columns(names, columns, source=source, read_sigma=read_sigma)
     lacking = lacking_columns(present)
@@ -143,7 +149,7 @@ def needed_columns(
 def columns_read(
     names: Sequence[str], header: Mapping[str, Any], options: ReadOptions, *, source: str
 ) -> tuple[dict[str, str], ReadOptions, tuple[str, ...]]:
-    """Column of each quantity, options with the pixel origin, and notes on both."""
+    """Column of each quantity, options with the pixel origin set, and notes on both."""
     needed = needed_columns(names, options.columns, source=source, read_sigma=options.read_sigma)
     _refuse_unused(options, needed, source)
     notes = _unused_centroid_errors(names, needed) if options.read_sigma else ()
@@ -194,7 +200,10 @@ def _refuse_unused(options: ReadOptions, found: Mapping[str, str], source: str) 
 
 
 def match_columns(quantities: Quantities, options: ReadOptions) -> dict[str, Any]:
-    """Arguments of `Matches` from rows of a table, with columns as from `needed_columns`."""
+    """Arguments of `Matches` from the rows of a table with the columns found by `needed_columns`.
+
+    Raises InputError if values are invalid, or if an option contradicts the columns.
+    """
     present, column = quantities.found, quantities.__getitem__
     out: dict[str, Any] = {}
     out["x"], out["y"] = (_pixels(column(key), options.pixel_origin) for key in ("x", "y"))
@@ -283,7 +292,10 @@ def _projected(quantities: Quantities, options: ReadOptions, epoch: Float | None
 
 
 def plane_unit(unit: str | None, *, source: str) -> str:
-    """Unit of u and v that are computed from sky positions; InputError for any other unit."""
+    """Unit of u and v that are computed from sky positions.
+
+    Raises InputError if `unit` is another one.
+    """
     if unit not in (None, "arcsec"):
         raise InputError(
             f"unit is {unit}, but sky positions come to the tangent plane in arcsec",
@@ -298,8 +310,8 @@ def nominal_columns(
 ) -> tuple[str, ...]:
     """'u_nominal' and 'v_nominal' if the table has them, otherwise empty.
 
-    InputError if only one is present, or if both are present with sky positions but without a
-    tangent point: their plane must not depend on which stars were matched.
+    Raises InputError if only one is present, or if both are present with sky positions but without
+    a tangent point: their plane must not depend on which stars were matched.
     """
     pair = ("u_nominal", "v_nominal")
     refuse_half(pair, found, where=source, what="nominal positions")
@@ -333,7 +345,7 @@ def _sigma(column: SourceColumn, unit: str) -> Float:
 
 
 def text_labels(column: SourceColumn) -> tuple[str, ...]:
-    """Names of the chips in a column; empty if they are numbers."""
+    """Names of the chips in a column of text; empty if the column holds numbers."""
     values = column.values
     plain = values.labels if isinstance(values, EncodedColumn) else np.asarray(values)
     if plain.dtype.kind not in "SUO":
@@ -357,8 +369,8 @@ def numbered_chips(
 ) -> tuple[Int, tuple[int, ...], tuple[str, ...]]:
     """Codes (N,) of the chips, their numbers in ascending order, and their names, if any.
 
-    `chips` gives the number of each name; the default is from 1 in the order of the names.
-    InputError for numbers that are not integers, and for names without a number.
+    `chips` gives the number of each name; by default names are numbered from 1 in natural order.
+    Raises InputError for numbers that are not integers, and for names without a number.
     """
     names = text_labels(column)
     if not names:

@@ -169,7 +169,10 @@ class ReadOptions:
                 )
 
     def refuse_fixed(self, source: str, kind: str, *names: str) -> None:
-        """Raise InputError for options that are fixed by the format `kind`."""
+        """Raise InputError for options that are set although the format `kind` fixes them.
+
+        `source` is the file, for the error message; `names` are the names of the options.
+        """
         why = f"the format {kind} fixes it"
         self.refuse(source, why, *names, do="leave {} out or set the format to 'table'")
 

@@ -163,9 +163,9 @@ def sky_positions(
 def catalogue_positions(
     table: Table, columns: Mapping[str, str] | None, *, source: str
 ) -> tuple[Float, Float] | None:
-    """RA and Dec (N,) in degrees as stored in a table, NaN if a row lacks one.
+    """RA and Dec (N,) in degrees as stored in a table, NaN in rows that lack one of them.
 
-    None if the reference positions are u, v.
+    The result is None if the reference positions are u, v.
     """
     table = with_sky_columns(table)
     column_names = find_columns(table.colnames, columns, ALIASES, source=source, pairs=PAIRS)
@@ -338,7 +338,10 @@ def sky_table(x: Any, y: Any, sky: SkyCoord, *, sigma: Any, epoch: Any, **column
 
 
 def icrs_of(sky: Any, n: int | None, *, where: str = "sky") -> SkyCoord:
-    """Sky coordinates (N,) in ICRS, with proper motions and obstime if they have them."""
+    """Sky coordinates (N,) in ICRS, with proper motions and obstime if they have them.
+
+    Raises InputError if `sky` is not a SkyCoord of shape (n,), or cannot be transformed to ICRS.
+    """
     from astropy.coordinates import ConvertError, SkyCoord
 
     if not isinstance(sky, SkyCoord):

@@ -53,7 +53,10 @@ def one_length(
 
 
 def columns_of(table: Any, names: Sequence[str]) -> dict[str, Any]:
-    """Columns of a table that are not None, by name."""
+    """Columns of a table that are not None, by name.
+
+    `table` has the columns as attributes.
+    """
     values = {name: getattr(table, name) for name in names}
     return {name: value for name, value in values.items() if value is not None}
 
@@ -90,9 +93,10 @@ def check_values(
     positive: Collection[str] = (),
     not_negative: Collection[str] = (),
 ) -> None:
-    """Raise InputError for columns with values that are not finite, or not positive if required.
+    """Raise InputError for columns with values that are not finite, or out of the allowed range.
 
-    `place` names the row in the message.
+    Columns named in `positive` must be positive, and those in `not_negative` must not be negative.
+    `place` returns the name of a row, given its index, for the message.
     """
     for name, values in columns.items():
         good, must = np.abs(values) < LARGEST, "finite"
@@ -164,7 +168,10 @@ def zero_motions(first: Any, second: Any) -> Bool:
 
 
 def counted(reasons: Sequence[tuple[str, Bool]], n: int) -> tuple[Bool, dict[str, int]]:
-    """Boolean mask of the n rows that remain, and counts of the others by their first reason."""
+    """Boolean mask (n,) of the rows that remain, and numbers of the others by their first reason.
+
+    `reasons` are pairs of a name and the mask (n,) of the rows to which it applies.
+    """
     stay, counts = np.ones(n, bool), dict[str, int]()
     for reason, gone in reasons:
         new = int((stay & gone).sum())
@@ -188,7 +195,7 @@ def without_missing(
     The other rows are counted by reason. With `reject`, values that are not finite count as
     missing. Missing values of `spared` quantities are allowed. For `motions`, NaN means that a star
     has no measured motion, as in catalogues; so do proper motions of exactly 0 on both axes, with a
-    warning. InputError if no row remains.
+    warning. Raises InputError if no row remains.
     """
     reasons = []
     motion_names = [found[key] for key in MOTION_KEYS if key in found and key not in spared]

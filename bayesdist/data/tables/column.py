@@ -41,7 +41,10 @@ _SPELLINGS = {
 
 
 def encoded(values: NDArray[Any], *, ordered: bool = False) -> tuple[Int, tuple[Any, ...]]:
-    """Codes (N,) of values, and the distinct values: sorted, or in the order of appearance."""
+    """Codes (N,) of values, and the distinct values.
+
+    The distinct values are in the order of their first appearance, or sorted if `ordered`.
+    """
     unique, first, codes = np.unique(values, return_index=True, return_inverse=True)
     codes = codes.astype(np.int64)
     if not ordered:
@@ -124,7 +127,10 @@ class SourceColumn:
             return read(replace(self, values=Column(column.plain, unit=column.unit)))
 
     def numbers(self) -> Float:
-        """Numbers (N,) in the file's unit; InputError for text, missing values, NaN or infinity."""
+        """Numbers (N,) in the file's unit.
+
+        Raises InputError for text, missing values, NaN or infinity.
+        """
         if isinstance(self.values, EncodedColumn):
             return self._by_label(SourceColumn.numbers)
         values = self._plain()
@@ -145,7 +151,7 @@ class SourceColumn:
         return out
 
     def numbers_or(self, value: float) -> Float:
-        """Numbers (N,), with `value` where missing or not finite; InputError for text."""
+        """Numbers (N,), with `value` where missing or not finite; raises InputError for text."""
         if isinstance(self.values, EncodedColumn):
             return replace(self, values=self.values.plain).numbers_or(value)
         mask = absent(self.values, not_finite=True)
@@ -184,7 +190,7 @@ class SourceColumn:
         return rows, named
 
     def known_numbers(self) -> Float:
-        """Numbers (N,), with NaN where missing; InputError for text and infinity."""
+        """Numbers (N,), with NaN where missing; raises InputError for text and infinity."""
         rows, named = self.known()
         out = np.full(len(self.values), np.nan)
         if len(rows):  # a column that holds only nulls has no type
@@ -206,7 +212,7 @@ class SourceColumn:
         return np.array(out)
 
     def integers(self) -> Int:
-        """Integers (N,); InputError for any other value."""
+        """Integers (N,); raises InputError for any other value."""
         if isinstance(self.values, EncodedColumn):
             return self._by_label(SourceColumn.integers)
         if np.asarray(getattr(self.values, "unmasked", self.values)).dtype.kind == "i":
@@ -244,10 +250,11 @@ class SourceColumn:
         return merged[codes], unique
 
     def years(self) -> Float:
-        """Epochs (N,) as decimal years; InputError for other values and years outside 1800 to 2200.
+        """Epochs (N,) as decimal years.
 
-        Numbers are years, or Modified Julian Dates if the unit of the column is the day. Strings
-        are such numbers or ISO dates.
+        Numbers are years, or Modified Julian Dates if the unit of the column is the day.  Strings
+        are such numbers or ISO dates.  Raises InputError for other values, and for years outside
+        1800 to 2200.
         """
         if isinstance(self.values, EncodedColumn):
             return self._by_label(SourceColumn.years)
@@ -404,7 +411,7 @@ def length_in_mm(unit: apu.UnitBase | str | None) -> float | None:
 
 
 def unit_of(column: Any, *, where: str) -> apu.UnitBase | None:
-    """Unit of a table column; None if it has none. InputError for an unknown unit."""
+    """Unit of a table column; None if it has none. Raises InputError for an unknown unit."""
     unit = getattr(column, "unit", None)
     if unit is None:
         return None
@@ -422,7 +429,10 @@ def unit_of(column: Any, *, where: str) -> apu.UnitBase | None:
 
 
 def conversion(unit: apu.UnitBase | str, to: str, *, where: str) -> float:
-    """Factor from values in `unit` to values in `to`; InputError for incompatible units."""
+    """Factor that converts values in `unit` to values in `to`.
+
+    Raises InputError if the units are incompatible.
+    """
     import astropy.units as apu
 
     try:

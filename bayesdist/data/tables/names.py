@@ -238,8 +238,8 @@ def known_unit(name: str, names: Iterable[str]) -> str | None:
 def origin_of(column: str, names: Iterable[str], header: Mapping[str, Any]) -> tuple[int, str]:
     """Coordinate (0 or 1) of the centre of the first pixel, and the reason.
 
-    `column` is the column of x. An empty reason means that nothing is known; 1 is then the FITS
-    convention.
+    `column` is the column of x.  If nothing is known, the reason is empty and the coordinate is 1,
+    the FITS convention.
     """
     for key, value in header.items():
         if str(key).lower() in _ORIGIN_KEYS and str(value).strip() in ("0", "1"):

@@ -94,7 +94,10 @@ class ParquetPart:
         return f"row group {group + 1} of {len(self.group_rows)}"
 
     def place(self, first: int) -> Place:
-        """Names of rows (row group and row, from 1), given their offsets from the row `first`."""
+        """Function that names a row by its row group and number (from 1).
+
+        Its argument is the offset of the row from the row `first`.
+        """
 
         def name(index: int) -> str:
             row = first + index
@@ -113,8 +116,8 @@ class ParquetPart:
     ) -> Iterator[RowBlock]:
         """Blocks of rows `start` to `stop` (counted from 0), of at most `size` rows each.
 
-        Columns in `encoded` are returned as `EncodedColumn`. InputError if the file is damaged,
-        missing, or has changed since it was described.
+        Columns in `encoded` are returned as `EncodedColumn`. Raises InputError if the file is
+        damaged, missing, or has changed since it was described.
         """
         import pyarrow
 
@@ -207,7 +210,10 @@ class ParquetPart:
 
 
 def describe_part(path: Path) -> ParquetPart:
-    """Description of a Parquet file from its footer; InputError if it is missing or damaged."""
+    """Description of a Parquet file from its footer.
+
+    Raises InputError if the file is missing or damaged.
+    """
     with _opened(path, str(path)) as stored, naming_faults(path):
         schema = stored.schema_arrow
         return ParquetPart(
