@@ -98,7 +98,7 @@ class Convergence:
         return float(np.nanmin(self.ess_tail))
 
     def worst(self, n: int) -> tuple[str, ...]:
-        """Names of the `n` parameters that are farthest from meeting the criteria."""
+        """Names of the `n` parameters that are farthest from meeting the criteria, worst first."""
         ess = np.minimum(self.ess_bulk, self.ess_tail)
         lacking = np.maximum(
             (self.rhat - 1) / max(self.limits.rhat - 1, 1e-6),
@@ -223,7 +223,8 @@ def pareto_k(log_weights: Float) -> float:
     """Shape k of the Pareto tail of importance weights; above 0.7 they cannot be trusted.
 
     Returns 0 if no weight exceeds twice the mean: such weights have no tail, and a shape fitted to
-    nearly equal weights would be meaningless.
+    nearly equal weights would be meaningless.  Returns infinity if there are too few weights, and
+    minus infinity if all weights are equal.
     """
     finite = log_weights[np.isfinite(log_weights)]
     if len(finite) < MIN_WEIGHTS or np.ptp(finite) < 1e-9:
@@ -264,7 +265,7 @@ def _pareto_smoothed(log_weights: Float, independent: float) -> tuple[Float, flo
 
 
 def rhat_and_bulk_draws(chains: Float, walkers: int = 1) -> Float:
-    """Rank-normalised split R-hat and bulk effective sample size, stacked to shape (2, D).
+    """Rank-normalised split R-hat and bulk effective sample size (2, D) of chains (C, N, D).
 
     The N draws of a chain are ordered by step and, within a step, by walker.  R-hat uses this
     order; it is the larger of the values for bulk and tails.  The effective sample size is that of
@@ -287,7 +288,10 @@ def rhat_and_bulk_draws(chains: Float, walkers: int = 1) -> Float:
 
 
 def tail_draws(chains: Float, tails: tuple[float, float]) -> Float:
-    """Effective sample size (D,) of the tails: the smaller value of the two `tails` quantiles."""
+    """Effective sample size (D,) of the tails of chains (C, N, D).
+
+    It is the smaller one of those of the two quantiles `tails`.
+    """
 
     def smaller(some: Float) -> Float:
         limits = np.quantile(some, tails, axis=(1, 2))
@@ -299,7 +303,7 @@ def tail_draws(chains: Float, tails: tuple[float, float]) -> Float:
 
 
 def mean_draws(chains: Float) -> Float:
-    """Effective sample size (D,) of the mean."""
+    """Effective sample size (D,) of the mean, from chains (C, N, D)."""
     return _by_parameters(lambda some: _effective(_halves(some)), chains)
 
 

@@ -78,7 +78,7 @@ class GroupedErrors:
 
     @property
     def sigma(self) -> Float:
-        """Added errors (G, 2)."""
+        """Added errors (G, 2) along u and v, in the unit of u and v."""
         return np.sqrt(self.variance)
 
     @property
@@ -88,12 +88,15 @@ class GroupedErrors:
 
     @property
     def excess(self) -> Float:
-        """Errors (G, 2) to add to the quoted ones; the smallest is left to the jitter."""
+        """Errors (G, 2) to add in quadrature to the quoted ones, apart from the jitter.
+
+        The smallest added variance is subtracted, because the jitter describes it for all groups.
+        """
         return np.sqrt(self.variance - self.variance.min())
 
     @property
     def added(self) -> AddedErrors | None:
-        """`excess` as `AddedErrors`; None if a single jitter is enough."""
+        """Errors `excess` as `AddedErrors`; None if a single jitter is enough."""
         if self.grouping == ONE:
             return None
         excess = self.excess
@@ -146,7 +149,7 @@ def grouped_errors(
     Raises
     ------
     InputError
-        If all matches have the same chip, exposure or filter `by` which they are to be grouped.
+        If `by` is given and all matches have the same chip, exposure or filter.
     DegenerateError
         If the sample does not determine the model.
     """

@@ -162,9 +162,9 @@ def refitted(
     good: Float,
     priors: GaussianPriors | None,
 ) -> tuple[LinearFit, Float]:
-    """Fit stars with variances (2, N), weighted by the probabilities `good` (N,).
+    """Fit stars with variances (2, N), weighted by the probabilities `good` (N,) of true matches.
 
-    Returns the fit and its residuals (2, N).
+    Returns the fit and its residuals (2, N), data minus model.
     """
     sigma_u, sigma_v = np.sqrt(variance) / np.sqrt(np.maximum(good, LEAST_WEIGHT))
     weighted = stars.with_errors((sigma_u, sigma_v))
@@ -173,9 +173,10 @@ def refitted(
 
 
 def false_matches(good: Float, square: Float, least: float) -> tuple[float, float]:
-    """Most probable fraction of false matches, and their variance per axis (at least `least`).
+    """Most probable fraction of false matches, and their variance per axis.
 
-    `good` (N,) are the probabilities of true matches, `square` (2, N) the squared residuals.
+    `good` (N,) are the probabilities of true matches, `square` (2, N) the squared residuals, and
+    `least` the smallest variance of false matches.
     """
     bad = 1.0 - good
     fraction = float((bad.sum() + FALSE[0] * FALSE[1]) / (len(bad) + FALSE[1]))
@@ -183,7 +184,7 @@ def false_matches(good: Float, square: Float, least: float) -> tuple[float, floa
 
 
 def residuals_of(fit: LinearFit, stars: Matches) -> Float:
-    """Residuals (2, N): data minus model."""
+    """Residuals (2, N) of stars from a fit, data minus model, in the order of the table."""
     prepared, order = prepare(fit.model, stars.with_errors(1.0))
     return in_table_order(prepared.residuals(fit.mean), order).T
 
@@ -236,7 +237,7 @@ class MagnitudeLaw:
         return cls(cell, design, start, penalty)
 
     def at_stars(self, nodes: Float) -> Float:
-        """Squared errors (2, N) of the stars, from ln sigma (2, B) at the nodes."""
+        """Squared errors (2, N) of the stars, from ln sigma (2, B) at the nodes of the law."""
         return np.asarray(np.exp(2.0 * nodes @ self.design.T)[:, self.cell])
 
     def climbed(self, nodes: Float, weight: Float, square: Float) -> Float:

@@ -346,7 +346,11 @@ class StarSums:
         levers: list[Float],
         cross: Float | None = None,
     ) -> StarSums:
-        """Sort matches, given in the order of `stars`, with their star codes (N,)."""
+        """Sort matches by group and star.
+
+        The matches are in the order of `stars`.  `code` (N,) are their star codes; see the class
+        for `weight`, `levers` and `cross`.
+        """
         bounds = [slice(a, b) for a, b in zip(stars.starts[:-1], stars.starts[1:], strict=True)]
         order = np.concatenate(
             [rows.start + np.argsort(code[rows], kind="stable") for rows in bounds]
@@ -368,7 +372,10 @@ class StarSums:
         )
 
     def each(self, influence: list[Float], first: int, end: int) -> Float:
-        """Sums (levers, 2, end - first, D) of the stars first..end, for each lever and axis."""
+        """Sums (levers, 2, end - first, D) for the stars from `first` to `end`, by lever and axis.
+
+        `influence` is the result of `influence_by_group`.
+        """
         out = np.zeros((len(self.levers), 2, end - first, influence[0].shape[2]))
         for g, phi in enumerate(self.phi):
             a = int(self.starts[g])
@@ -395,7 +402,8 @@ class StarSums:
     ) -> Float:
         """Covariances (levers, D, D) from errors with variances (n_stars, 2) common to a star.
 
-        The sums of so many stars are computed at a time that they take at most `scratch` bytes.
+        `influence` is the result of `influence_by_group`.  Stars are processed in chunks whose sums
+        take at most `scratch` bytes.
         """
         D, n_stars = influence[0].shape[2], len(variances[0])
         out = np.zeros((len(variances), D, D))

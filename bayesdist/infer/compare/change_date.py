@@ -68,7 +68,7 @@ class ChangeDate:
 
 
 def period_scores(new: NewFit, change: Change, matches: Matches) -> tuple[PeriodScore, ...]:
-    """Scores of the periods in chronological order, from one pass over the data in chunks.
+    """Scores of all periods in chronological order, from one pass over the data in chunks.
 
     `matches` are those of `new`, with epochs.  With at most `MOST_PERIODS` dates, each date is a
     period.

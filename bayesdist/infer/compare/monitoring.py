@@ -95,7 +95,7 @@ class NewFit:
 
     @property
     def open(self) -> DistortionModel:
-        """Model in which the frames have only the parameters that the data cannot determine."""
+        """Model whose frames have only those parameters that the data cannot determine."""
         if self.model.gauge == "first":
             return self.model
         return replace(

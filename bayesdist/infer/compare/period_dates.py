@@ -20,7 +20,9 @@ MOST_MJD = 2e6  # about five thousand years, close to the range of date librarie
 
 
 def mjd_periods(centres: Sequence[float], days: float) -> dict[str, tuple[float, float]]:
-    """Periods of `days` days centred on Modified Julian Dates, named after the central date.
+    """Start and end dates (decimal years) of periods of `days` days, by name.
+
+    Each period is centred on a Modified Julian Date and named after it.
 
     Raises InputError if the length is not positive or a centre is not a valid date.
     """
@@ -74,9 +76,9 @@ def check_periods(periods: Periods) -> None:
 def sum_by_period(matches: Matches, periods: Periods, task: Callable[[Matches], Any]) -> Any:
     """Sum the results of `task` over the matches of each period, in one pass over the data.
 
-    `task` is called with the matches of a period in each chunk, and its results are added.  Matches
-    outside all periods [start, end) are ignored.  Returns the sums by name of the period.  Raises
-    InputError if there are no epochs, periods overlap, or a period has no matches.
+    `task` is called with the matches of a period in each chunk; its results must support addition.
+    Matches outside all periods [start, end) are ignored.  Returns the sums by name of the period.
+    Raises InputError if there are no epochs, periods overlap, or a period has no matches.
     """
     location = ", ".join(matches.sources)
     if not matches.has_epoch:

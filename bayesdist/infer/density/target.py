@@ -77,7 +77,7 @@ class Target:
     def log_density(self, psi: Float) -> Float:
         """Log posterior (n,) of points (n, D), up to a constant, in one pass over the data.
 
-        Minus infinity for points that are not finite or outside the support.
+        The result is minus infinity for points that are not finite or outside the support.
         """
         ok = np.isfinite(psi).all(axis=1)
         out = np.full(len(psi), -np.inf)
@@ -93,8 +93,8 @@ class Target:
         """Value, gradient (D,) and minus the Hessian of the log posterior at a point (D,).
 
         The Hessian may be indefinite away from the mode.  If `em` is True, it is computed with EM
-        weights, which make the distortion part positive semidefinite.  Takes one pass over the
-        data.
+        weights, which make the distortion part positive semidefinite.  The computation takes one
+        pass over the data.
         """
         model = self.model
         theta, h = psi[: self.n_theta], psi[self.n_theta :]

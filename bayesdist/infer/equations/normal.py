@@ -159,7 +159,10 @@ def mixture(stars: Stars, theta: Float, constants: Constants, em: bool = False) 
 
 
 def starting_point(first: NormalEquations, model: DistortionModel, priors: GaussianPriors) -> Float:
-    """Starting parameters: frames from linear fits, then polynomials with these frames fixed."""
+    """Starting parameters (n_params,), from the normal equations `first` about zero.
+
+    Frames are derived from linear fits, and polynomials are then fitted with these frames fixed.
+    """
     groups = first.groups
     theta = np.zeros(model.n_params)
     if model.n_frame:

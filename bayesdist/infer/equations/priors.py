@@ -115,7 +115,10 @@ class GaussianPriors:
         return out
 
     def matrix(self, model: DistortionModel, n_tail: int = 0) -> Arrow:
-        """Prior precision as an arrow matrix (with a zero edge)."""
+        """Prior precision as an arrow matrix with a zero edge.
+
+        The border has `n_tail` additional rows of zeros, for hyperparameters.
+        """
         n, q, g = len(model.local_blocks), model.n_frame, model.n_global
         local = self.precision[g:].reshape(n, q) if n else np.zeros((0, q))
         blocks = np.einsum("nq,qr->nqr", local, np.eye(q))

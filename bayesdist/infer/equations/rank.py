@@ -139,10 +139,10 @@ def check_coverage(
 ) -> None:
     """Raise DegenerateError if the data cannot determine the model.
 
-    Refused are fewer measurements (including `n_priors` informative priors) than parameters, too
-    few stars in an exposure, a chip without stars, stars outside a chip or on a line, and stars
-    that cover too small a part of a chip.  The last two are not checked if the polynomials are
-    `known` from an earlier calibration.
+    This is the case if there are fewer measurements (including `n_priors` informative priors) than
+    parameters, too few stars in an exposure, no stars on a chip, stars outside a chip or on a line,
+    or stars that cover too small a part of a chip.  The last two are not checked if the polynomials
+    are `known` from an earlier calibration.
     """
     n = survey.n
     if 2 * n + n_priors < model.n_params:

@@ -101,7 +101,7 @@ class HierarchicalFit(Solution):
 
     @property
     def index(self) -> Int:
-        """Indices in theta of the deviations."""
+        """Indices (m,) in theta of the deviations."""
         return self.scatter.index
 
     @cached_property
@@ -135,6 +135,7 @@ class HierarchicalFit(Solution):
         Returns
         -------
         dict of str to (float, float)
+            Lower and upper end, in the unit of the parameter.
         """
         tail = (1 - probability) / 2
         ends = np.quantile(self.tau_draws, [tail, 1 - tail], axis=0).T

@@ -107,7 +107,10 @@ def with_drift_of(
 def drift_priors(
     reference: Solution, model: DistortionModel, *, chip: int = 2
 ) -> dict[str, tuple[float, float]]:
-    """Independent priors (mean, sigma) on a model's rates and steps, by name, from a reference.
+    """Independent priors (mean, sigma) on the rates and steps of a model, by parameter name.
+
+    They are derived from the drift of a reference solution; `chip` is the number of the reference
+    chip.
 
     The polynomials of the model must be along the axes of the reference chip, as in
     `held_in_reference`.  A remaining rotation of about 1e-5, due to the error of the first

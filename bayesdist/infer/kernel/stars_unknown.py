@@ -231,7 +231,7 @@ class EliminationSums(NamedTuple):
 
     @classmethod
     def zero(cls, n_groups: int, order: int) -> EliminationSums:
-        """Sums that are zero."""
+        """Sums of zeros for `n_groups` groups and polynomials of total order `order`."""
         K, M = (order + 1) * (order + 2) // 2, (order + 1) * (2 * order + 1)
         shapes = (n_groups, 3, M + -M % WIDTH), (n_groups, 2, K + -K % WIDTH), (3,)
         return cls(*map(np.zeros, shapes))

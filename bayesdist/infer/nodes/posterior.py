@@ -164,7 +164,7 @@ class TablePosterior:
 
     @property
     def means(self) -> LookupTable:
-        """Table of the posterior means, without errors (see `table`), which take time."""
+        """Table of the posterior means, without errors, which take time (see `table`)."""
         return self.grid.table(np.stack([axis.mean for axis in self.axes]), filter=self.filter)
 
     @cached_property

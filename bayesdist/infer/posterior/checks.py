@@ -37,7 +37,7 @@ def scatter_too_small(total: float, dof: float) -> bool:
 
 @dataclass(frozen=True)
 class ChiSquare:
-    """Chi-square of a fit with the quoted errors, and what may account for it.
+    """Chi-square of a fit with the quoted errors, and circumstances that affect its meaning.
 
     Parameters
     ----------
@@ -59,9 +59,9 @@ class ChiSquare:
     def check(self, findings: Sequence[str] = ()) -> Check:
         """Check that chi-square is about one per degree of freedom.
 
-        `findings` are names of what else was found in the residuals.  Residuals that are larger
-        than the quoted errors say nothing about these errors if the model does not describe the
-        positions.
+        `findings` are the names of other findings in the residuals, such as missing terms.  If the
+        model does not describe the positions, large residuals are no evidence against the quoted
+        errors.
         """
         ratio = self.total / self.dof if self.dof > 0 else float("nan")
         small = scatter_too_small(self.total, self.dof)

@@ -42,7 +42,7 @@ class Memberships:
     draws: int
 
     def in_table_order(self, order: Int) -> Memberships:
-        """Memberships reordered to the rows of the table; `order` is that of `prepare`."""
+        """Memberships reordered to the rows of the table; `order` (N,) is that of `prepare`."""
         return Memberships(
             in_table_order(self.outlier_probability, order),
             in_table_order(self.log_likelihood, order),
@@ -52,7 +52,10 @@ class Memberships:
 
 
 def some_draws(theta: Float, h: Float, n_stars: int) -> tuple[Float, Float]:
-    """Evenly spaced subset of the draws: fewer if there are more stars (narrower posterior)."""
+    """Evenly spaced subset of the draws theta (n, D) and h (n, n_hyper).
+
+    It is smaller if there are more stars, because the posterior is then narrower.
+    """
     n = int(np.clip(EVALUATIONS // n_stars, LEAST_DRAWS, MOST_DRAWS))
     rows = np.linspace(0, len(theta) - 1, min(n, len(theta))).astype(int)
     return theta[rows], h[rows]

@@ -269,7 +269,8 @@ class Posterior(Solution):
 
         Examples
         --------
-        >>> matches, truth = bd.simulate_wise(500, rng=np.random.default_rng(1))
+        >>> from bayesdist.missions.wise import simulate_wise
+        >>> matches, truth = simulate_wise(500, rng=np.random.default_rng(1))
         >>> fit = bd.fit_linear(matches, bd.build_model(matches, order=2, size=(1016, 1016)))
         >>> tree = bd.sample(fit, matches, seed=1, target_ess=100).to_datatree()
         >>> tree["posterior"]["theta"].dims

@@ -63,7 +63,7 @@ EVERY_S = 10.0  # seconds between two lines
 
 @dataclass(frozen=True)
 class ChainSettings:
-    """ChainSettings of a sampling run."""
+    """Settings of a sampling run."""
 
     seeds: tuple[int, ...]  # one per ensemble
     n_stars: int  # number of stars, which determines the cost of a pass
@@ -117,7 +117,10 @@ class Chains:
 
 
 def ensemble_seeds(seed: int, ensembles: int) -> tuple[int, ...]:
-    """Seed of each ensemble; raises InputError for fewer than two, which cannot be compared."""
+    """Seed of each ensemble, derived from the seed of the run.
+
+    Raises InputError if there are fewer than two ensembles, which could not be compared.
+    """
     if ensembles < 2:
         raise InputError(
             f"{ensembles} ensemble cannot show convergence", where="sampler.ensembles", do="use 4"

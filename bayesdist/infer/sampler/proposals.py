@@ -99,7 +99,9 @@ def pilot_batch(
     folder: Path | None = None,
     fingerprint: str = "",
 ) -> ProposalBatch:
-    """Draw and evaluate the first batch, used to rate the proposal and to start the chains.
+    """Draw and evaluate the first batch of n proposals per ensemble.
+
+    The batch is used to assess the proposal and to start the chains.
 
     If `folder` is given, the densities are stored in a file and read from it by a resumed run; the
     proposals themselves are drawn again.  Raises InputError if the file cannot be read or written,

@@ -102,10 +102,11 @@ def mixing_steps(n_params: int) -> int:
 def has_mixed(ess: float, n_params: int, walkers: int, *, hopeless: bool = False) -> bool:
     """True if Crank-Nicolson moves mix well enough: each walker has made enough effective draws.
 
-    With many parameters, one effective draw per walker is enough, since differential evolution
-    would make fewer in the same number of passes.  If that is `hopeless`, two are required, because
-    sampling would otherwise take more than about a minute.  `walkers` is the total number of
-    walkers of all ensembles.
+    `ess` is the effective number of draws of all walkers, and `walkers` the total number of walkers
+    of all ensembles.  With many parameters, one effective draw per walker is enough, since
+    differential evolution would make fewer in the same number of passes.  If differential evolution
+    is `hopeless` (see `is_hopeless`), two are required, because sampling would otherwise take more
+    than about a minute.
     """
     if n_params <= MANY:
         return ess >= DRAWS_PER_WALKER.value * walkers
@@ -195,7 +196,11 @@ def _chance_rhat(limits: Limits, n_params: int, ensembles: int) -> float:
 
 
 def first_check(limits: Limits, cost: float, n_params: int, ensembles: int, walkers: int) -> float:
-    """Number of draws after warm-up at the first check; `cost` is draws per effective draw."""
+    """Number of draws after warm-up at the first check.
+
+    `cost` is the number of draws per effective draw, and `walkers` the number of walkers per
+    ensemble.
+    """
     slack = 1.05 + 3 / np.sqrt(max(limits.ess, 1.0))  # allows for the scatter of estimated ESS
     return max(
         slack * cost * limits.ess,
@@ -205,7 +210,7 @@ def first_check(limits: Limits, cost: float, n_params: int, ensembles: int, walk
 
 
 def next_check(made: int, verdict: Convergence, n_stars: int, walkers: int) -> float:
-    """Number of draws at the next check, from the last diagnostics and the criteria.
+    """Number of draws at the next check, from the last diagnostics `verdict` and its criteria.
 
     `made` is the number of draws at the last check, and `walkers` the total number of walkers of
     all ensembles.

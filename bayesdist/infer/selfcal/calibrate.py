@@ -287,11 +287,11 @@ def _previous(star: Int) -> Int:
 def scatter_by_magnitude(
     problem: Problem, theta: Float, mixture: Mixture, stars: Float, mag: Float
 ) -> tuple[Float, Float]:
-    """Estimate the errors of the detections in bins of magnitude.
+    """Errors of the detections in bins of magnitude, from their distances to the stars.
 
-    Returns the median magnitude of each bin (bins,) and the error per axis in pixels (bins,).  The
-    scatter is corrected for the degrees of freedom that the stars' positions absorb.  `mag` (N,) is
-    in the order of the problem.
+    Returns the median magnitude (bins,) of each bin and the error per axis (bins,) in pixels.  The
+    scatter is corrected for the degrees of freedom that the stars' positions absorb.  `stars` (S,
+    q) are the modes of the stars, and `mag` (N,) is in the order of the problem.
     """
     w = memberships(problem, theta, mixture, stars)
     precision = w / (problem.var + mixture.jitter**2)

@@ -198,7 +198,11 @@ def _passes(
 
 
 def memberships(problem: Problem, theta: Float, mixture: Mixture, stars: Float) -> Float:
-    """Probability (N,) that each detection belongs to its star."""
+    """Probability (N,) that each detection belongs to its star.
+
+    `theta` (D,) are the parameters of the model, and the search for the modes of the stars starts
+    at `stars` (S, q).
+    """
     p = problem
     j2, log_core, log_out = mixture.constants(p.log_outlier)
     places = p.places(theta)
@@ -309,10 +313,11 @@ def _states(problem: Problem, member: Float) -> NDArray[np.int8]:
 
 
 def log_marginal(problem: Problem, theta: Float, mixtures: Float, modes: StarModes) -> Float:
-    """Log densities (n,) of theta (n, D) with the stars integrated out (Laplace).
+    """Log densities (n,) of theta (n, D), with the stars integrated out, up to a constant.
 
-    They are up to a constant.  `mixtures` (n, 2) are the jitter in pixels and the fraction of false
-    detections.  `modes` of a nearby solution provide the starting points for the stars' modes.
+    The integral is a Laplace approximation.  `mixtures` (n, 2) are the jitter in pixels and the
+    fraction of false detections.  `modes` of a nearby solution provide the starting points for the
+    stars' modes.
     """
     p = problem
     rows = np.array([Mixture(j, f).constants(p.log_outlier) for j, f in mixtures])
@@ -378,12 +383,12 @@ def at_stars(piece: StarPiece, theta: Float) -> StarPiece:
 
 
 def at_means(piece: StarPiece, theta: Float) -> StarPiece:
-    """Piece with the stars at the means of their detections."""
+    """Piece linearised at theta (D,), with the stars at the means of their detections."""
     return at_stars(replace(piece, stars=piece.problem.mean_places(theta)), theta)
 
 
 def at_medians(piece: StarPiece, theta: Float) -> StarPiece:
-    """Piece with the stars at the medians of their detections."""
+    """Piece linearised at theta (D,), with the stars at the medians of their detections."""
     return at_stars(replace(piece, stars=piece.problem.median_places(theta)), theta)
 
 
@@ -397,7 +402,10 @@ def at_modes(piece: StarPiece, theta: Float, mixture: Mixture, observed: bool) -
 
 
 def moved(piece: StarPiece, before: Float, after: Float) -> StarPiece:
-    """Piece re-linearised at parameters (D,); stars move like the means of their detections."""
+    """Piece re-linearised after a change of the parameters (D,) from `before` to `after`.
+
+    Stars move like the means of their detections.
+    """
     p, stars = piece.problem, piece.stars.copy()
     stars[:, :2] += p.shifts(before, after)
     return StarPiece(p.at(after, stars), stars)
@@ -481,9 +489,9 @@ def gathered(problem: Problem, pieces: MappedPieces[StarPiece]) -> StarPiece:
 def in_pieces(
     problem: Problem, stars: Float, compute: Compute | None = None
 ) -> Iterator[MappedPieces[StarPiece]]:
-    """Context with the detections and stars (S, q) as a single piece here or many on a cluster.
+    """Context with the detections and stars (S, q), as one piece here or as many on a cluster.
 
-    Raises InputError like `ClusterPieces`.
+    Raises the InputErrors of `ClusterPieces`.
     """
     piece = StarPiece(problem, stars)
     pieces: MappedPieces[StarPiece] = _Whole(piece)
@@ -503,7 +511,7 @@ def each_of(
 ) -> Iterable[T]:
     """Results of a function for each source, in their order, computed here or on a cluster.
 
-    Raises InputError like `ClusterPieces`.
+    Raises the InputErrors of `ClusterPieces`.
     """
     if compute is None or compute.engine != "dask":
         return map(function, sources)
@@ -515,7 +523,7 @@ def each_of(
 
 @contextmanager
 def one_cluster(compute: Compute | None) -> Iterator[Compute | None]:
-    """Context in which all calls of `in_pieces` with the yielded compute share one cluster."""
+    """Context in which all calls of `in_pieces` with the yielded `Compute` share one cluster."""
     if compute is None or compute.engine != "dask":
         yield compute
         return

@@ -158,7 +158,7 @@ class Gauge:
 
     @property
     def unsettled(self) -> tuple[str, ...]:
-        """Those of `sentences` on what other data or priors would determine."""
+        """Subset of `sentences` about properties that other data or priors would determine."""
         return tuple(text for text, is_settled in self._remarks if not is_settled)
 
     @property

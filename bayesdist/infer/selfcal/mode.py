@@ -114,11 +114,12 @@ class SelfCalibrationMode:
 
     @property
     def gain(self) -> float:
-        """Information about the distortion of a further exposure, relative to the average one.
+        """Information of a further exposure about the distortion, in units of the average exposure.
 
-        Each star takes up one of its detections, or as many as it has parameters along an axis,
-        and less where other data say where it lies.  So m detections of a star have the information
-        of m - 1, and further ones of the same star that of as many as they are.
+        The position of a star absorbs the information of one of its detections (of more if the star
+        also moves, and of less if its position is known from other data).  A star with m detections
+        therefore contributes the information of m - 1, while further detections of it contribute
+        fully.
         """
         p, error = self.problem, self.error
         data = np.bincount(p.star, (p.W[:, 0] + p.W[:, 2]) / 2, minlength=p.n_stars) / error**2
@@ -133,7 +134,7 @@ class SelfCalibrationMode:
 
     @cached_property
     def solution(self) -> LinearFit:
-        """Solution for distortion and frames, with the statistics of the residuals.
+        """Linear solution for distortion and frames, with the statistics of the residuals.
 
         Its covariance is the inverse of the curvature with the stars eliminated.
         """
@@ -170,9 +171,10 @@ class SelfCalibrationMode:
 
 
 def of_first(curvature: Float, free: Int, n: int) -> Float:
-    """Information (n, n) about the first n parameters, later ones eliminated; zero for fixed ones.
+    """Information (n, n) about the first n parameters, with later ones eliminated.
 
-    `curvature` (D, D) is that of all parameters, and `free` (F,) are those that are fitted.
+    `curvature` (D, D) is minus the Hessian with respect to all parameters, and `free` (F,) are the
+    indices of those that are fitted.  Rows and columns of fixed parameters are zero.
     """
     own, later = free[free < n], free[free >= n]
     left = curvature[np.ix_(own, own)]
@@ -441,7 +443,10 @@ def mode_at(
     *,
     compute: Compute | None = None,
 ) -> SelfCalibrationMode:
-    """Restore a mode from its parameters; `problem` must be linearised there."""
+    """Restore a mode from its parameters; `problem` must be linearised there.
+
+    See `SelfCalibrationMode` for the arguments.
+    """
     with of.in_pieces(problem, stars, compute) as loaded:
         pieces = loaded.map(of.at_modes, theta, mixture, True)
         expansion, at_solution = (
@@ -553,9 +558,9 @@ def expected_solution(
 
 
 def expected_curvature(model: DistortionModel, truth: Float, detections: Detections) -> Float:
-    """Curvature (D, D) of the log-likelihood by all parameters, its stars marginalised.
+    """Minus the Hessian (D, D) of the log-likelihood, with the stars integrated out.
 
-    Arguments are as of `expected_solution`.
+    See `expected_solution` for the arguments.
     """
     return _expanded(model, truth, detections, 2)[1]
 

@@ -491,7 +491,10 @@ def contacts_of(model: DistortionModel, theta: Float, epoch: Float | None = None
 def places_of(
     model: DistortionModel, detections: Detections, theta: Float, dilation: Float | None = None
 ) -> Float:
-    """Sky position (N, 2) of each detection according to the model."""
+    """Sky position (N, 2) of each detection according to the model, in the unit of u and v.
+
+    `dilation` (E,) is the scale of the sky in each exposure, about the origin of the frames.
+    """
     out = model.predict(theta, detections.x, detections.y, **_where(model, detections))
     if dilation is None:
         return out

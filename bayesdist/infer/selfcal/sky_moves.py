@@ -96,7 +96,10 @@ def rates(model: DistortionModel, theta: Float, years: Float) -> dict[str, Float
 
 
 def functionals(model: DistortionModel, theta: Float) -> dict[str, Float]:
-    """Rows (D,) such that row @ (change of theta) is the change of a property, by name."""
+    """Derivatives (D,) of the properties of a solution with respect to its parameters, by name.
+
+    The properties are those of `NamedDirection`.
+    """
     out: dict[str, Float] = {}
     first = model.chips[0]
     maps = {c.number: _sky_map(model, theta, c.number) for c in model.chips}

@@ -452,6 +452,11 @@ def describe(
     Returns
     -------
     Verdict
+
+    Raises
+    ------
+    DegenerateError
+        If the exposures do not determine a candidate.
     """
     chosen = default_candidates(breaks) if candidates is None else candidates
     comparison = compare(series, chosen, seed=seed)

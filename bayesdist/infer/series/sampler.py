@@ -123,7 +123,7 @@ class Draws:
         )
 
     def judged(self, problem: SeriesProblem, limits: Limits) -> Convergence:
-        """Convergence diagnostics of all reported quantities."""
+        """Convergence diagnostics of all reported quantities, for the criteria `limits`."""
         n_chains, n_steps = self.fraction.shape
         names = problem.series.coefficients
         k = len(names)
@@ -578,7 +578,10 @@ class BreakMoves:
         self._seen = np.zeros_like(self.density)
 
     def possible(self, breaks: Float) -> Bool:
-        """Boolean mask (...): dates (..., B) that ascend, with enough exposures in each segment."""
+        """Boolean mask (...) that is True for possible dates (..., B) of breaks.
+
+        Dates must ascend, with enough exposures in each segment.
+        """
         place = np.searchsorted(self.epoch, breaks)
         shape = (*breaks.shape[:-1], 1)
         edges = np.concatenate([np.zeros(shape, int), place, np.full(shape, len(self.epoch))], -1)

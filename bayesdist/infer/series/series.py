@@ -315,7 +315,7 @@ class Series:
 
 @dataclass(frozen=True)
 class Form:
-    """Parameters of a kind of trend."""
+    """Levels, slopes and random part of a kind of trend."""
 
     levels: bool = False  # True for a level per segment, False for a common level
     # 'none'; 'one' for a common slope; 'each' for a slope per segment; 'kinks' if also continuous

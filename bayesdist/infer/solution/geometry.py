@@ -128,6 +128,11 @@ def geometry_of(solution: Solution, chip: int | None = None) -> Geometry:
     Returns
     -------
     Geometry
+
+    Raises
+    ------
+    InputError
+        If there is no such chip.
     """
     model = solution.model
     number_of_chip = model.chips[0].number if chip is None else chip

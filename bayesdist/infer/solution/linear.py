@@ -54,6 +54,11 @@ class Rejection:
         Factor on the inverse variance in the corners; it increases with the square of the radius
         from 1 at the centre.
 
+    Raises
+    ------
+    InputError
+        If a limit or the weight is not positive.
+
     Examples
     --------
     >>> strict = bd.Rejection(clip_chi2=16.0, clip_abs=None)

@@ -106,7 +106,7 @@ class Solution(ABC):
 
     @property
     def likelihood(self) -> Likelihood | None:
-        """Likelihood of a star's residual at the mean; None for a transformed solution."""
+        """Likelihood of a star's residual at the mean; None if the solution has none."""
         return None
 
     def uses(self, matches: Matches) -> Bool:
@@ -226,7 +226,7 @@ class TransformedSolution(DerivedSolution):
 
 @dataclass(frozen=True, eq=False)
 class LinearMap:
-    """Multiply the first n of the parameters (..., D) by a matrix (m, n); can be pickled."""
+    """Linear map of the first n of the parameters (..., D) by a matrix (m, n); can be pickled."""
 
     matrix: Float
 

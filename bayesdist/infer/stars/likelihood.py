@@ -220,7 +220,10 @@ class Hyper:
 
     @np.errstate(over="ignore", invalid="ignore")
     def values(self, h: Float) -> dict[str, Float]:
-        """Convert points h (..., n_hyper) to values (...) of what is sampled of j, f and s_out."""
+        """Values (...) by name of those of j, f and s_out that are sampled.
+
+        `h` (..., n_hyper) are points in sampled coordinates.
+        """
         out = {}
         for k, name in enumerate(self.mixture.hyper):
             t = h[..., k]

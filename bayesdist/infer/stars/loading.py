@@ -15,7 +15,10 @@ from bayesdist.model import DistortionModel
 def opened(
     model: DistortionModel, matches: Matches | Shards, compute: Compute | None = None
 ) -> Iterator[Shards]:
-    """Context that loads the data as shards (see `load`) and closes them at the end."""
+    """Context with the data loaded as shards (see `load`), which are closed at the end.
+
+    Shards that were passed as `matches` stay open.
+    """
     shards = load(model, matches, compute)
     try:
         yield shards

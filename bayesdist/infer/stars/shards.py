@@ -183,7 +183,10 @@ class LocalShards(Shards):
 
 
 def shard_of(model: DistortionModel, reader: BatchReader, n_total: int) -> tuple[Stars, Survey]:
-    """Load a shard; return its stars and its survey.  `n_total` is the number of all stars."""
+    """Load a shard and return its stars and its survey.
+
+    `n_total` is the number of all stars, of which the survey samples a fraction.
+    """
     table = reader.load()
     stars, _ = prepare(model, table)
     return stars, survey(stars, table, max(1, n_total // SAMPLE))

@@ -48,16 +48,16 @@ class Stars:
 
     @property
     def columns(self) -> tuple[Float, ...]:
-        """X, Y, u, v, var_u, var_v."""
+        """Columns X, Y, u, v, var_u and var_v, each (N,)."""
         return self.X, self.Y, self.u, self.v, self.var_u, self.var_v
 
     @property
     def offsets(self) -> tuple[Float, ...]:
-        """off_u and off_v; empty if nominal positions are unknown."""
+        """Columns off_u and off_v, each (N,); empty if nominal positions are unknown."""
         return () if self.off_u is None or self.off_v is None else (self.off_u, self.off_v)
 
     def circle(self, constants: Constants) -> tuple[Float, ...]:
-        """`offsets` if the constants have a match circle; otherwise empty."""
+        """Columns `offsets` if the constants have a match circle; otherwise empty."""
         return self.offsets if constants.radius else ()
 
     @property
