@@ -61,7 +61,7 @@ class BudgetTerm:
 
     @property
     def radial(self) -> Float:
-        """hypot(u, v), (P,)."""
+        """Radial errors hypot(u, v), shape (P,)."""
         return np.hypot(self.u, self.v)
 
     def on(self, chip: int, rows: slice) -> BudgetTerm:
@@ -206,12 +206,12 @@ class ErrorBudget:
 
     @property
     def x(self) -> Float:
-        """FITS 1-based columns (P,)."""
+        """Pixel coordinates x (P,) of the positions, FITS 1-based."""
         return self.domain.x[self._compared]
 
     @property
     def y(self) -> Float:
-        """FITS 1-based rows (P,)."""
+        """Pixel coordinates y (P,) of the positions, FITS 1-based."""
         return self.domain.y[self._compared]
 
     @property
@@ -221,7 +221,7 @@ class ErrorBudget:
 
     @property
     def epoch(self) -> float | None:
-        """Decimal years."""
+        """Epoch of the budget in decimal years; None if the model does not depend on time."""
         return self.domain.epoch
 
     @property
@@ -269,13 +269,13 @@ class ErrorBudget:
 
     @property
     def share(self) -> Float:
-        """Fraction of the positions at which each term is the largest."""
+        """Fraction of the positions at which each term is the largest, shape (number of terms,)."""
         dominant = self.dominant
         return np.bincount(dominant, minlength=len(self.terms)) / dominant.size
 
     @property
     def chips(self) -> tuple[ErrorBudget, ...]:
-        """Budget of each chip."""
+        """Budget of each chip, in the order of `domain.chips`."""
         return tuple(
             replace(
                 self,
@@ -297,7 +297,7 @@ class ErrorBudget:
         return grid_pixels(place.chip.size, self.domain.grid)
 
     def on_grid(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Map (ny, nx) of values (N,) of a budget over the grid of one chip; NaN elsewhere."""
+        """Map (ny, nx) of values (P,) of a budget over the grid of one chip; NaN elsewhere."""
         x, y = self.axes
         gridded = np.full((y.size, x.size), np.nan)
         gridded[np.searchsorted(y, self.y), np.searchsorted(x, self.x)] = values

@@ -230,7 +230,7 @@ class EvaluationDomain:
         return tuple(dict.fromkeys(self.chip.tolist()))
 
     def by_chip(self) -> Iterator[tuple[int, slice]]:
-        """Chip numbers, each with the slice of its positions."""
+        """Yield each chip number with the slice of its positions."""
         start = 0
         for number in self.chips:
             stop = start + int((self.chip == number).sum())
@@ -239,7 +239,7 @@ class EvaluationDomain:
 
     @cached_property
     def basis(self) -> dict[int, Float]:
-        """Basis functions (N, K) of the model at the positions, by chip number."""
+        """Basis functions (n, K) of the model at the n positions on each chip, by chip number."""
         return {
             chip: self.model.basis(chip).evaluate(self.x[rows], self.y[rows])
             for chip, rows in self.by_chip()
@@ -421,7 +421,7 @@ def sizes(axis: str, error: Float) -> Float:
 
 
 def of_sizes(base: str, size: Float) -> Float:
-    """Statistic named in `_BASE`, over the last axis."""
+    """Statistic of sizes (..., N) over the last axis: 'max', 'mean', 'rms' or a percentile."""
     if base == "max":
         return size.max(axis=-1)
     if base == "mean":

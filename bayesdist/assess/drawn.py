@@ -98,8 +98,8 @@ class DrawnErrors:
     def treatments(self, grid: tuple[int, int] | None) -> tuple[DrawnErrors, ...]:
         """Draws in which every term that may vary over the field does so.
 
-        Returns two variants: as smooth fields, and independently at every position. Empty if no
-        term may vary.
+        Returns two variants: as smooth fields, and independently at every position.  The result is
+        empty if no term may vary.
 
         `grid`: number of points along x and y over which a smooth field has its stated size.
         """

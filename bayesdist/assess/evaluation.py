@@ -69,7 +69,7 @@ class EvaluationSettings:
     given : tuple of str
         Names of the errors that the user states.
     dates : ndarray
-        Dates of the matches, decimal years.
+        Dates of the matches, decimal years; empty if unknown.
     field : Region
         Part of the detector that sees the sky, as returned by `check_region`. Errors are evaluated
         only there.
@@ -164,17 +164,20 @@ def evaluate(
     files: Sequence[Known] = (),
     null: Float | None = None,
 ) -> Evaluation:
-    """Maps, budget, margins and validity periods of a calibration.
+    """Evaluate a calibration: maps, error budget, margins and validity periods.
 
     Parameters
     ----------
     errors : ErrorModel
+        All errors of positions.
     diagnostics : Diagnostics
+        Diagnostics of `solution`.
     requirements : sequence of Requirement
     settings : EvaluationSettings
     rng : numpy.random.Generator
         Every result restarts the generator, so that results do not depend on each other.
     fit : LinearFit
+        Least-squares fit, for the maps of formal errors.
     solution : Posterior
         Posterior with all errors of the parameters in its draws.
     checks : sequence of Check

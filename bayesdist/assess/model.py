@@ -75,6 +75,7 @@ class ErrorModel:
         n : int
             Number of draws, at least 2.
         rng : int or numpy.random.Generator
+            Seed or random generator.
 
         Returns
         -------
@@ -144,6 +145,7 @@ class ErrorModel:
         Returns
         -------
         tuple of LookupTable
+            Standard deviations of u and v at the grid points, in the unit of the solution.
         """
         model, out = self.solution.solution.model, []
         for chip in model.chips:
@@ -166,10 +168,18 @@ class ErrorModel:
         n : int
             Number of draws.
         rng : int or numpy.random.Generator
+            Seed or random generator.
 
         Returns
         -------
         ErrorBudget
+            In the unit of u and v.
+
+        Raises
+        ------
+        InputError
+            If `n` is less than two, the epoch is missing, or the domain has a magnitude but no
+            errors by magnitude are known.
         """
         return budget_of(self.drawn(n, rng), domain)
 

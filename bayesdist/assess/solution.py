@@ -128,7 +128,7 @@ def chip_places(solution: Solution, *, epoch: float | None = None) -> tuple[tupl
     -------
     tuple of (row, column)
         In the order of the model's chips. Row 0 is at the top (largest y), column 0 at the left.
-        No two chips have the same row and column: if they would, all are in one column.
+        If two chips would have the same row and column, all chips are placed in one column.
 
     Raises
     ------

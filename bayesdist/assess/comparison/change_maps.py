@@ -34,16 +34,20 @@ class Monitored:
 
     @property
     def p_value(self) -> float:
-        """Probability of a mean change at least as large by chance.
+        """Probability that chance alone gives a mean change at least as large.
 
-        If the scatter of the periods is significantly larger than their errors, it is used instead.
+        If the scatter of the periods is significantly larger than their errors, it is used instead
+        of them.
         """
         test = self.change.test
         return self._judged(test.chi2, test.dof, test.p_value)
 
     @property
     def p_since(self) -> float | None:
-        """Probability of a change at least as large by chance at one of several dates."""
+        """Probability that chance alone gives a change at least as large at any of the dates.
+
+        The result is None if the new matches have no epochs, or a single period.
+        """
         if self.date is None or len(self.date.gain) == 1:
             return None
         gain, n = float(self.date.gain.max()), len(self.date.gain)
@@ -57,14 +61,14 @@ class Monitored:
 
     @property
     def p_either(self) -> float:
-        """Probability of the two tests combined: twice the smaller one."""
+        """p-value of both tests combined: twice the smaller one of `p_value` and `p_since`."""
         return (
             self.p_value if self.p_since is None else min(1.0, 2 * min(self.p_value, self.p_since))
         )
 
     @property
     def changed(self) -> bool:
-        """True if the release no longer describes the matches."""
+        """True if the released solution no longer describes the new matches."""
         return self.p_either < DIFFERENCE.value
 
     @property
@@ -74,12 +78,12 @@ class Monitored:
 
     @property
     def worst(self) -> Comparison:
-        """The chip with the largest change."""
+        """Comparison for the chip with the largest change."""
         return max(self.maps, key=lambda m: m.largest)
 
     @property
     def verdict(self) -> str:
-        """The verdict in one sentence."""
+        """Verdict in one sentence."""
         m, late = self.worst, self.since_a_date
         test = self.date.change.test if late and self.date is not None else self.change.test
         x, y = m.position_of_largest
@@ -120,7 +124,7 @@ class Monitored:
 
     @property
     def doubts(self) -> list[str]:
-        """Reasons for doubt, as sentences."""
+        """Reasons to doubt the verdict, as sentences."""
         out = []
         if self.scatters and self.date is not None:
             out.append(

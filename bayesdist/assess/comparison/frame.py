@@ -262,7 +262,7 @@ class GapDifference:
 
     @property
     def sigma(self) -> Float | None:
-        """Standard errors (4,)."""
+        """Standard errors (4,) of `values`; None if neither side has errors."""
         return None if self.cov is None else np.sqrt(np.maximum(np.diag(self.cov), 0.0))
 
 

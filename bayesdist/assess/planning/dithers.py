@@ -372,8 +372,9 @@ class FurtherDithers:
         """Effect of the exposures' deviations on the polynomials with n further exposures.
 
         The effect is an rms over the detector, for the same scatter of scale and shears, relative
-        to that at present. A power of the number of exposures between the numbers for which it is
-        computed, and the inverse of its square root beyond `MOST_FURTHER`.
+        to that at present. It is interpolated as a power of the number of exposures between the
+        numbers for which it is computed, and decreases with the square root of that number beyond
+        `MOST_FURTHER`.
         """
         E = len(self.mode.problem.model.exposures)
         total = E + self._known.number

@@ -94,7 +94,7 @@ class ExistingData:
 def with_more_data(z: Float, rho: float, truth: int, noise: int) -> Float:
     """Posterior draws (n, ...) with 1 + rho times today's data, from today's draws `z`.
 
-    `truth` and `noise` are the numbers of the draws that are used as the true value, and as the
+    `truth` and `noise` are the indices of the draws that are used as the true value and as the
     error of the further data.
     """
     m = z.mean(axis=0)
@@ -116,22 +116,25 @@ class Scattering:
     odds: Float | None = None
 
     def truth(self, uniform: float) -> int:
-        """Number of the draw that is taken as the truth, from a uniform random number."""
+        """Index of the draw that is taken as the truth, from a uniform random number in [0, 1)."""
         if self.odds is None:
             return int(uniform * len(self.variances))
         cumulative = np.cumsum(self.odds)
         return int(min(np.searchsorted(cumulative, uniform * cumulative[-1]), len(cumulative) - 1))
 
     def resized(self, error: Float, rows: Int) -> Float:
-        """Errors (DRAWS, N, 2) with the scatters of the draws `rows`, each with its own pattern.
+        """Errors (DRAWS, N, 2) rescaled to the scatters of the draws `rows` (DRAWS,).
 
-        A few draws that are chosen again and again would have the same few patterns.
+        Each draw keeps its own pattern: a few draws that are chosen again and again would have the
+        same few patterns.
         """
         size = np.sqrt(self.variances.sum(axis=1))
         return np.asarray((size[rows] / np.maximum(size, 1e-300))[:, None, None] * error)
 
     def chosen(self, n: int, data: ExistingData, truth: int, rng: np.random.Generator) -> Int:
-        """Draws (DRAWS,) that are probable after n more exposures if draw `truth` is true.
+        """Indices (DRAWS,) of draws that are probable after n more exposures if `truth` is true.
+
+        `truth` is the index of a draw.
 
         Deviations are measured with the precision that the stars of an exposure allow. The
         likelihood uses the sum of all scatters, with as many degrees of freedom as there are large
@@ -161,7 +164,7 @@ class Futures:
     errors : ErrorModel
         Present error model; it includes the errors of centroids if the requirement has a magnitude.
     requirement : Requirement
-    data : Data
+    data : ExistingData
         Data that were used for the error model.
     solution : callable
         Function of additional information (d, d) on polynomials and drift that returns the solution
@@ -486,13 +489,13 @@ class Schedule:
     together: Sequence[Further] = ()
 
     def of(self, n: int) -> list[Float]:
-        """Information (d, d) of n exposures: equally probable values."""
+        """Information (d, d) of n exposures, as a list of equally probable values."""
         return [further.information(n) for further in self.together] or [n * self.information]
 
     def deviations(self, n: int, n_existing: int) -> list[float]:
         """Effect of the exposures' deviations on their mean, relative to the present one.
 
-        A list with one value for each information in `of`.
+        The list has one value for each information in the result of `of`.
         """
         independent = float(np.sqrt(n_existing / (n_existing + n)))
         return [further.deviations(n) for further in self.together] or [independent]
@@ -527,7 +530,7 @@ class Need:
 
     @property
     def sentence(self) -> str:
-        """The need in one sentence."""
+        """Number of exposures needed, in one sentence."""
         if self.exposures == 0:
             return f"{self.schedule}: met as it is (probability {self.probability:.3g})"
         if self.exposures is None:
@@ -546,7 +549,10 @@ class Need:
 
     @property
     def table(self) -> str:
-        """Probabilities of the numbers that were evaluated, as text; empty if already met."""
+        """Numbers of exposures that were evaluated, with their probabilities, as text.
+
+        The text is empty if the requirement is already met.
+        """
         return ", ".join(f"{n}: {p:.2f}" for n, p in self.by_number.items())
 
 

@@ -459,7 +459,7 @@ class RequiredReduction:
 
     @property
     def sentence(self) -> str:
-        """The reduction in one sentence."""
+        """Required reduction in one sentence."""
         if not self.enough:
             return (
                 f"no term can do it alone: the largest, {self.term} ({self.now:.3g} {self.unit} "
@@ -523,17 +523,23 @@ class ValidityPeriod:
 
     @property
     def date(self) -> float | None:
-        """Date at which the probability falls below the required one; None if it does not."""
+        """Date (decimal years) at which the probability falls below the required one.
+
+        None if it does not.
+        """
         return self._fall(self.probability)
 
     @property
     def interval(self) -> tuple[float | None, float | None]:
-        """Such dates for both ends of the interval of the probability, the earlier one first."""
+        """Dates at which the ends of the interval of the probability fall below the required one.
+
+        The earlier date comes first; a date is None if the probability does not fall below.
+        """
         return self._fall(self.low), self._fall(self.high)
 
     @property
     def sentence(self) -> str:
-        """The date in one sentence."""
+        """Validity period in one sentence."""
         name, asked = self.requirement.name, self.requirement.probability
         first, last = float(self.epoch[0]), float(self.epoch[-1])
         if self.date is None:

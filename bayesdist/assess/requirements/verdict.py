@@ -135,7 +135,7 @@ def rests_on(
     single: bool,
     dates: Float,
 ) -> tuple[str, ...]:
-    """Clauses on what a verdict at an epoch assumes or is based on.
+    """Clauses that state the assumptions and measurements on which a verdict at an epoch is based.
 
     `epoch`: decimal years. `given`: names of the errors that the user states. `aligned`, `single`:
     see `error_model`. `dates`: dates of the matches, decimal years.
@@ -221,7 +221,7 @@ class Tally:
     pools: list[tuple[Pool, ...]] = field(default_factory=list)
 
     def add(self, values: Float, pools: tuple[Pool, ...]) -> None:
-        """Add further draws."""
+        """Add the values (n,) of further draws, and the sets from which they were taken."""
         self.values.append(values)
         self.pools.append(pools)
 

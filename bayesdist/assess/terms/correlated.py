@@ -111,7 +111,7 @@ class Deviations:
 
     @property
     def rows(self) -> tuple[Row, ...]:
-        """A single row."""
+        """Row of the deviations."""
         return (Row(DEVIATIONS, source=SOURCE),)
 
     def draw(self, n: int, rng: np.random.Generator) -> Polynomials:
@@ -278,7 +278,7 @@ class LocalErrors:
 
     @property
     def rows(self) -> tuple[Row, ...]:
-        """A single row."""
+        """Row of the local error."""
         return (Row(self.name, LOCAL, self.source),)
 
     def draw(self, n: int, rng: np.random.Generator) -> Independent:

@@ -85,11 +85,24 @@ class ErrorTerm(Protocol):
 
     @property
     def rows(self) -> tuple[Row, ...]:
-        """Rows of the budget."""
+        """Rows of the error budget to which the term contributes, in a fixed order."""
         ...
 
     def draw(self, n: int, rng: np.random.Generator) -> ErrorDraws:
-        """Draw the error n times; each draw applies to all chips and epochs."""
+        """Draw the error n times; each draw applies to all chips and epochs.
+
+        Parameters
+        ----------
+        n : int
+            Number of draws.
+        rng : numpy.random.Generator
+            Source of all random numbers of the term.
+
+        Returns
+        -------
+        ErrorDraws
+            Draws in the unit of u and v.
+        """
         ...
 
 
@@ -132,13 +145,17 @@ class ErrorDraws(Protocol):
         ...
 
     def on(self, domain: EvaluationDomain, image: Image) -> ErrorField:
-        """Errors at the positions of a domain, in an image."""
+        """Errors at the positions of a domain, for a star in the given image."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class ErrorField(ABC):
-    """Errors of a term at the N positions of a domain."""
+    """Errors of a term at the N positions of a domain.
+
+    Mean squares have shape (P, 2), for u and v.  P is N for errors of positions, and the number of
+    pairs if the domain is for differences between positions.
+    """
 
     rows: tuple[Row, ...]
     domain: EvaluationDomain
@@ -187,7 +204,7 @@ class DrawnField(ErrorField):
     @property
     @abstractmethod
     def n_draws(self) -> int:
-        """Number of draws."""
+        """Number of draws, including repeated ones."""
 
     @property
     def n_different(self) -> int:
@@ -196,14 +213,21 @@ class DrawnField(ErrorField):
 
     @abstractmethod
     def errors(self, draws: slice, scale: Scale) -> Float:
-        """Errors (d, N, 2) of the draws in a slice, with rows multiplied by factors."""
+        """Errors (d, N, 2) of the d draws in a slice.
+
+        `scale` has factors by which rows are multiplied, by name of the row; missing rows have the
+        factor 1.
+        """
 
     def total(self) -> Float:
         """Mean squares (P, 2) of the sum of all rows."""
         return self.by_draws(slice(0, self.n_different))
 
     def by_draws(self, draws: slice) -> Float:
-        """Mean squares (P, 2) over the draws in a slice, evaluated in blocks."""
+        """Mean squares (P, 2) over the draws in a slice.
+
+        The errors are evaluated in blocks of draws, to limit memory.
+        """
         pairs, total, n = self.domain.pairs(), 0.0, draws.stop - draws.start
         step = max(1, BLOCK // max(self.domain.size, 1))
         for start in range(draws.start, draws.stop, step):
@@ -564,7 +588,7 @@ class Known:
 
     @property
     def rows(self) -> tuple[Row, ...]:
-        """A single row."""
+        """Row of the displacements."""
         return (self.row,)
 
     def draw(self, n: int, rng: np.random.Generator) -> Known:

@@ -183,7 +183,24 @@ class UserTerm:
                 )
 
     def sigma(self, unit: str, pixel_scale: float | None = None) -> tuple[float, float]:
-        """(sigma_u, sigma_v) in the unit of a model; `pixel_scale` in mas, see `units.convert`."""
+        """Standard deviations (sigma_u, sigma_v), converted to the unit of a model.
+
+        Parameters
+        ----------
+        unit : str
+            'pix', 'arcsec', 'mas' or 'deg'.
+        pixel_scale : float, optional
+            Size of a pixel in mas, needed for conversions from or to pixels.
+
+        Returns
+        -------
+        sigma_u, sigma_v : float
+
+        Raises
+        ------
+        InputError
+            If a unit is unknown, or a conversion needs the pixel scale.
+        """
         location = f"budget term {self.name!r}"
         su, sv = (
             convert(s, self.unit or unit, unit, pixel_scale, where=location)
@@ -204,17 +221,25 @@ class UserTerm:
         Returns
         -------
         UserTerm
+
+        Raises
+        ------
+        InputError
+            See `sigma`.
         """
         su, sv = self.sigma(unit, pixel_scale)
         return replace(self, sigma_u=su, sigma_v=sv, unit=unit)
 
     @property
     def rows(self) -> tuple[Row, ...]:
-        """A single row."""
+        """Row of the budget, with the name, kind and source of the term."""
         return (Row(self.name, self.kind, self.source),)
 
     def draw(self, n: int, rng: np.random.Generator) -> ErrorDraws:
-        """Draw one offset for the whole field or independent errors, in the unit of the term."""
+        """Draw one offset for the whole field, or independent errors, in the unit of the term.
+
+        `n` is the number of draws; for random errors it has no effect.
+        """
         size = np.array([self.sigma_u, self.sigma_v])
         if self.kind == "random":
             return Independent(self.rows[0], partial(_everywhere, size))
@@ -390,7 +415,7 @@ class SmoothTerm:
 
     @property
     def rows(self) -> tuple[Row, ...]:
-        """Row of the term."""
+        """Row of the budget, which is that of the original term."""
         return self.term.rows
 
     def draw(self, n: int, rng: np.random.Generator) -> Functions:
@@ -423,7 +448,7 @@ class Centroids:
 
     @property
     def rows(self) -> tuple[Row, ...]:
-        """A single row."""
+        """Row of the centroid errors."""
         return (Row(CENTROID, "random"),)
 
     def draw(self, n: int, rng: np.random.Generator) -> Independent:

@@ -131,7 +131,7 @@ class ScaleError:
 
     @property
     def rows(self) -> tuple[Row, ...]:
-        """A single row."""
+        """Row of the scale or orientation error."""
         return (Row(self.name, source=self.source, in_total=self.in_total),)
 
     def draw(self, n: int, rng: np.random.Generator) -> Polynomials:
@@ -164,7 +164,10 @@ def one_size_kinds() -> tuple[str, ...]:
 
 
 def one_size_term(name: str, kind: str, sigma: float, solution: Solution, source: str) -> ErrorTerm:
-    """Error term of a kind; for the parameters see `ScaleError`."""
+    """Error term of a kind from `one_size_kinds`.
+
+    See `ScaleError` for the arguments.
+    """
     make = (ONE_SIZE | mission_objects(lambda mission: mission.error_terms))[kind]
     return make(name, kind, sigma, solution, source)
 
@@ -248,7 +251,7 @@ class SolutionErrors:
         return (*(Row(name) for name in names), *(r for c in self.catalogue for r in c.rows))
 
     def draw(self, n: int, rng: np.random.Generator) -> SolutionDraws:
-        """Draws of the solution, and of the rows that are only shown."""
+        """Draws of the solution, and draws of the rows that the budget shows but does not add."""
         joint = shown = self.solution.drawn_rows(n, rng)
         (spawned,) = rng.spawn(1)  # rows that are only shown must not change later random numbers
         if self.without is not None:
