@@ -195,7 +195,10 @@ def product_settings() -> dict[str, type[FormatSettings]]:
 
 
 def format_of(key: str) -> Format:
-    """Format that can be built, by its key; InputError if there is none."""
+    """Format that can be built, by its key.
+
+    Raises InputError if there is none.
+    """
     for format_ in all_formats():
         if format_.key == key and format_.build is not None:
             return format_
@@ -254,7 +257,10 @@ def build(
     settings: FormatSettings,
     options: BuildOptions = BuildOptions(),  # noqa: B008
 ) -> tuple[Built, ...]:
-    """Build the files of a format in memory; InputError for values that the format cannot hold."""
+    """Build the files of a format in memory.
+
+    Raises InputError for a calibration that the format cannot represent.
+    """
     format_ = format_of(key)
     if calibration.model.order > format_.highest_order:
         raise InputError(
@@ -276,7 +282,7 @@ def build(
 def read_back(
     key: str, files: Sequence[Built], calibration: Calibration, options: BuildOptions
 ) -> Sequence[ReadBack]:
-    """Evaluate positions by the files of a format.
+    """Positions computed from the files of a format.
 
     `calibration` and `options` are those that the files were built from. By default, files are read
     as other programs read them, without their stored parameters, and several files of one chip each

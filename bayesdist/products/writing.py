@@ -102,7 +102,7 @@ def write_calibration(
 def settings_of(key: str, values: Mapping[str, Any]) -> FormatSettings:
     """Validated settings of a format that can be built; `values` are its configuration keys.
 
-    InputError for unknown keys, invalid values and missing values.
+    Raises InputError for unknown keys, invalid values and missing values.
     """
     kind = product_settings()[key]
     keys = list(kind.model_fields)
@@ -203,7 +203,8 @@ def built_for(
 def places_of(built: Sequence[Built], target: Path) -> list[Path]:
     """Output paths: inside `target` if it is a folder, else `target` and its companion files.
 
-    InputError if `target` is a file name but there are several files that hold no parameters.
+    Raises InputError if `target` is a file name but there are several files that hold no
+    parameters.
     """
     if target.is_dir():
         return [target / part.file_name for part in built]

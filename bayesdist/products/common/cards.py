@@ -158,7 +158,10 @@ def keyword_of(card: str) -> str:
 
 
 def named_in(header: fits.Header, keyword: str, where: str) -> str:
-    """Text value of a keyword, empty if it is missing; FormatError if it is NaN or infinite."""
+    """Text value of a keyword; empty if the keyword is missing.
+
+    Raises FormatError if the value is NaN or infinite; `where` is the file, for the message.
+    """
     value = header.get(keyword, "")
     if isinstance(value, float) and not math.isfinite(value):
         raise FormatError(f"is {value}", where=f"{where}, keyword {keyword}", do="give a name")
@@ -166,7 +169,7 @@ def named_in(header: fits.Header, keyword: str, where: str) -> str:
 
 
 def header_of(cards: Iterable[str]) -> fits.Header:
-    """Header of these cards."""
+    """FITS header that consists of the given cards."""
     return fits.Header.fromstring("".join(cards))
 
 

@@ -234,7 +234,10 @@ def refuse_oversized(header: fits.Header, where: str) -> None:
 
 
 def wcs_of(header: fits.Header, where: str, opened: fits.HDUList | None = None) -> WCS:
-    """WCS of a header by astropy.wcs; InputError if astropy.wcs refuses it."""
+    """WCS of a header by astropy.wcs, with the look-up tables of the file `opened`, if given.
+
+    Raises InputError if astropy.wcs refuses the header.
+    """
     from astropy import log
     from astropy.wcs import WCS, SingularMatrixError  # slow to import
 

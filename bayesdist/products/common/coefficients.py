@@ -65,7 +65,7 @@ def coefficient_matrix(coefficients: Coefficients, order: int | None = None) -> 
 def evaluate(
     coefficients: Coefficients, x: ArrayLike, y: ArrayLike, order: int | None = None
 ) -> Float:
-    """Values of a polynomial; terms above the total `order` are left out."""
+    """Values of a polynomial at points of any shape; terms above the total `order` are left out."""
     return polynomial_values(coefficient_matrix(coefficients, order), x, y)
 
 
@@ -120,6 +120,10 @@ def largest_magnitude(
         Lowest and highest values of x and of y.
     order : int, optional
         Terms above this total order are left out.
+
+    Returns
+    -------
+    float
     """
     c = coefficient_matrix(coefficients, order)
     low = np.array([x_range[0], y_range[0]], float)
@@ -153,7 +157,7 @@ def _candidates(low: Float, high: Float) -> tuple[Float, Float]:
 def radial_orders(
     x: Mapping[tuple[int, int], float], y: Mapping[tuple[int, int], float]
 ) -> frozenset[int]:
-    """Orders n at which the coefficients are those of a purely radial distortion.
+    """Orders n at which coefficients {(i, j): c} include those of a purely radial distortion.
 
     A distortion k r^(n-1) (x, y), with n odd, has the coefficients k binomial((n-1)/2, j) of
     x^(n-2j) y^2j along x, and those with x and y exchanged along y. Other terms of that order may

@@ -79,7 +79,7 @@ class Hdu:
     def rows(self) -> NDArray[np.void]:
         """Rows of a binary table with native byte order and without trailing blanks in text.
 
-        FormatError if this is not a binary table, or if its cards cannot be read.
+        Raises FormatError if this is not a binary table, or if its cards cannot be read.
         """
         if self.header.get("XTENSION", "").strip() != "BINTABLE":
             raise FormatError(f"HDU {self.name!r} is no binary table")
@@ -161,7 +161,10 @@ class Content:
             return (Hdu(card_images(header), state=state),)
 
     def whole(self) -> tuple[Hdu, ...]:
-        """HDUs of a complete FITS file; FormatError if it is not FITS, truncated or damaged."""
+        """HDUs of a complete FITS file.
+
+        Raises FormatError if the content is not FITS, or is truncated or damaged.
+        """
         hdus = self.hdus if self.is_fits else ()
         if not hdus or self.raw[:9] != HDU_STARTS[0]:
             raise FormatError("is no FITS file", where=self.name, do="check the file")
@@ -183,7 +186,7 @@ class Content:
 
     @cached_property
     def damage(self) -> FormatError | None:
-        """FormatError if the content starts like FITS but is damaged, otherwise None."""
+        """Raises FormatError if the content starts like FITS but is damaged, otherwise None."""
         try:
             self.whole()
         except FormatError as error:
@@ -227,7 +230,7 @@ def read_content(path: str | os.PathLike[str]) -> Content:
 
 
 def read_hdus(path: str | os.PathLike[str]) -> tuple[Hdu, ...]:
-    """Read the HDUs of a complete FITS file; errors as for `read_content` and `Content.whole`."""
+    """Read the HDUs of a complete FITS file; raises the errors of `read_content` and `whole`."""
     return read_content(path).whole()
 
 

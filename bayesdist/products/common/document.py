@@ -115,7 +115,11 @@ def required_size(
     name: str,
     what: str = "image",
 ) -> tuple[float, float]:
-    """Columns and rows stated by a file, or else `given`; MissingSizeError if both are None."""
+    """Columns and rows stated by a file, by default those given by the user.
+
+    Raises MissingSizeError if both are None.  `name` is the file and `what` the object that has the
+    size, for the message.
+    """
     size = given if stated is None else stated
     if size is None:
         raise MissingSizeError(
@@ -156,7 +160,11 @@ class FormatSettings(BaseModel):
         size: tuple[float, float] | None,
         reference_pixel: tuple[float, float] | None,
     ) -> None:
-        """Raise ValueError for a detector that the format does not support."""
+        """Raise ValueError if the format does not support the detector.
+
+        `detector` is its name, `size` has its columns and rows, and `reference_pixel` is in FITS
+        1-based pixels; None if unknown.
+        """
 
 
 @dataclass(frozen=True)
@@ -284,12 +292,24 @@ class Document:
     holds: Any
 
     def lint(self) -> tuple[Finding, ...]:
-        """Findings of the format's checks."""
+        """Findings of the format's checks; empty if the format has none.
+
+        Raises
+        ------
+        FormatError
+            If a value in the file cannot be interpreted.
+        """
         with readable(self.name):
             return () if self.format.lint is None else tuple(self.format.lint(self.holds))
 
     def describe(self) -> str:
-        """Text that describes the content of the file and ends with the findings."""
+        """Text that describes the content of the file and ends with the findings.
+
+        Raises
+        ------
+        FormatError
+            If a value in the file cannot be interpreted.
+        """
         with readable(self.name):
             return "\n".join(self.format.describe(self.holds))
 
@@ -304,7 +324,13 @@ class Document:
             return None if self.format.mirrored is None else self.format.mirrored(self.holds)
 
     def tables(self) -> tuple[LookupTable, ...]:
-        """Look-up tables of the detector; InputError if the format has none."""
+        """Look-up tables of the detector.
+
+        Raises
+        ------
+        InputError
+            If the format has no look-up tables.
+        """
         if self.format.tables is None:
             raise InputError(
                 f"is {self.format.title}, which holds no look-up tables of a detector",

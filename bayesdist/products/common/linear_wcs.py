@@ -54,7 +54,11 @@ def image_size(header: fits.Header) -> tuple[int, int] | None:
 def finite_number(
     header: fits.Header, keyword: str, where: str, default: float | None = None
 ) -> float:
-    """Value of a keyword or the default; FormatError if it is missing or no finite number."""
+    """Value of a keyword, or the default.
+
+    Raises FormatError if the keyword is missing and has no default, or if its value is no finite
+    number.
+    """
     value = header.get(keyword, default)
     if value is None:
         raise FormatError("is missing", where=f"{where}, keyword {keyword}", do="add the keyword")

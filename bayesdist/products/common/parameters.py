@@ -104,7 +104,10 @@ def stored_in(content: Content) -> Hdu | None:
 
 
 def stored_calibration(hdu: Hdu, name: str) -> Calibration:
-    """Calibration of a parameter table; FormatError if the table is incomplete or inconsistent."""
+    """Calibration from the HDU of a parameter table.
+
+    Raises FormatError if the table is incomplete or inconsistent; `name` is the file.
+    """
     header, rows = hdu.header, hdu.rows
     location = f"{name}, extension {EXTENSION}"
     missing = {"CHIP", "AXIS", "I", "J", "VALUE", "COV", "NX", "NY", "XREF", "YREF"} - set(
@@ -182,7 +185,7 @@ def refuse_other(far: float, most: float, where: str) -> None:
 def agreeing(stored: Calibration, read: Calibration) -> Calibration:
     """Stored calibration, after checking that the calibration read from the product agrees.
 
-    FormatError if chips or units differ, or if positions differ by more than `AGREE` pixels.
+    Raises FormatError if chips or units differ, or if positions differ by more than `AGREE` pixels.
     """
     chips = [(c.number, c.size) for c in stored.model.chips]
     if chips != [(c.number, c.size) for c in read.model.chips] or stored.unit != read.unit:

@@ -30,7 +30,7 @@ class ReadBack:
 def by_calibrations(
     file: str, sets: Sequence[Calibration], time: TimeDependence | None
 ) -> ReadBack:
-    """Positions by the calibrations of a file that defines separate axes.
+    """Positions computed from the calibrations of a file that defines its own axes.
 
     `sets` holds one calibration, or one per segment of the drift. `time` is the time dependence of
     the solution that the file was made from.

@@ -90,8 +90,10 @@ def at_date(
 ) -> Calibration:
     """Calibration of one chip at one date, in arcsec, with the look-up tables of that chip.
 
-    InputError, which names the configuration section `where`, if u and v are in pixels and no scale
-    is given, if a date is missing, or if there are look-up tables after the polynomial.
+    `epoch` is in decimal years, and `scale_arcsec` is the size of a pixel for u and v in pixels.
+
+    Raises InputError, which names the configuration section `where`, if u and v are in pixels and
+    no scale is given, if a date is missing, or if there are look-up tables after the polynomial.
     """
     if calibration.model.time is not None and epoch is None and calibration.reference_date is None:
         raise InputError(
@@ -213,7 +215,7 @@ def calibration_from(
 ) -> Calibration:
     """Calibration of a record; `table_values` (2, ny, nx) are its look-up tables in order.
 
-    FormatError for a record of another version or with missing parts.
+    Raises FormatError for a record of another version or with missing parts.
     """
     location = f"{name}, bayesdist"
     if record.get("version") != VERSION:

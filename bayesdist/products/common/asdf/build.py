@@ -44,10 +44,10 @@ class ChipTransform:
 def chip_transforms(
     calibration: Calibration, settings: PlacedSettings, options: BuildOptions, where: str
 ) -> Iterator[ChipTransform]:
-    """Transforms of all chips; `where` is the configuration section named in messages.
+    """Yield the transform of each chip; `where` is the configuration section named in messages.
 
-    InputError if neither the settings nor the calibration give the position or orientation in V2,
-    V3, and for the reasons given in `at_date` and `fitted_inverse`.
+    Raises InputError if neither the settings nor the calibration give the position or orientation
+    in V2, V3, and for the reasons given in `at_date` and `fitted_inverse`.
     """
     plane = _placed(calibration.plane, settings, where)
     matrix = required(plane.to_v2v3, "the plane of an aperture has no axes along V2 and V3")

@@ -73,14 +73,20 @@ class DistortionFile:
         return ARCSEC.get(self.units[1], 1.0) * at
 
     def grid(self) -> tuple[Float, Float]:
-        """FITS 1-based pixels on a grid over the detector; MissingSizeError if size is unknown."""
+        """FITS 1-based pixels x, y on a grid over the detector.
+
+        Raises MissingSizeError if the size of the detector is unknown.
+        """
         if self.size is None:
             raise _no_size(self.name)
         return detector_grid(self.size, GRID)
 
 
 def transform_in(tree: Mapping[str, Any], key: str, where: str) -> Model:
-    """Transform of two coordinates to two stored under `key`; FormatError for anything else."""
+    """Transform of two coordinates to two stored under `key`.
+
+    Raises FormatError for anything else.
+    """
     model = tree.get(key)
     if not isinstance(model, Model):
         content = (
@@ -101,7 +107,10 @@ def transform_in(tree: Mapping[str, Any], key: str, where: str) -> Model:
 
 
 def closure_of(forward: Model, back: Model, x: Float, y: Float) -> float:
-    """Largest distance of pixels (N,) from where forward and inverse return them; may be NaN."""
+    """Largest closure error: distance in pixels after the forward and inverse transformations.
+
+    x and y (N,) are FITS 1-based pixels.  The result is NaN if a transform gives no position.
+    """
     with np.errstate(all="ignore"):
         returned = evaluated(back, *evaluated(forward, x - 1.0, y - 1.0))
     return float(np.hypot(returned[0] - (x - 1.0), returned[1] - (y - 1.0)).max())
@@ -127,7 +136,10 @@ def departure(file: DistortionFile, calibration: Calibration) -> float:
 
 
 def transforms_read_back(files: Mapping[int, DistortionFile]) -> ReadBack:
-    """Positions in V2, V3 by the files of the chips, and the errors of their inverses."""
+    """Positions in V2, V3 computed from the files of the chips, and the errors of their inverses.
+
+    `files` has the file of each chip, by chip number.
+    """
 
     def read_back(file: DistortionFile) -> ReadBack:
         back = file.inverse
@@ -151,8 +163,8 @@ def distortion_calibration(file: DistortionFile, choice: Choice) -> Calibration:
     """Calibration in arcsec, with the covariance of the record if the transform agrees with it.
 
     For a file without record, (u, v) are V2, V3 relative to the middle of the detector.
-    MissingSizeError if neither the file nor `choice` gives the size; InputError if the transform is
-    not a polynomial.
+    Raises MissingSizeError if neither the file nor `choice` gives the size, and InputError if the
+    transform is not a polynomial.
     """
     notes: tuple[str, ...] = ()
     if file.record is not None:

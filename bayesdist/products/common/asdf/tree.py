@@ -56,7 +56,7 @@ _START = b"#ASDF"
 
 
 def is_asdf(content: Content) -> bool:
-    """True if a file begins like an ASDF file."""
+    """True if the content begins like an ASDF file."""
     return content.raw[: len(_START)] == _START
 
 
@@ -68,10 +68,11 @@ def tree_of(content: Content) -> Mapping[str, Any]:
 def packed(
     tree: Mapping[str, Any], name: str, in_text: Iterable[NDArray[np.generic]] = ()
 ) -> bytes:
-    """Bytes of an ASDF file with this tree; InputError if asdf is not installed.
+    """Bytes of an ASDF file with this tree.
 
     Arrays in `in_text` are written as text: pipelines close the file before they evaluate a
-    transform, and arrays in binary blocks are not read until then.
+    transform, and arrays in binary blocks are not read until then.  Raises InputError if asdf is
+    not installed; `name` is the file for its message.
     """
     stream = io.BytesIO()
     file = asdf_with_transforms(name).AsdfFile(dict(tree))
