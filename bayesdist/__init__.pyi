@@ -2,8 +2,8 @@
 
 from .app.calibrate import calibrate as calibrate
 from .app.calibrations import read_calibration as read_calibration
-from .app.run import (
-    Run as Run,
+from .app.run import Run as Run
+from .app.runs import (
     open_run as open_run,
     run as run,
 )

@@ -14,18 +14,16 @@ from typing import Any
 import numpy as np
 import tomli_w
 
+from bayesdist.app.artefacts.reader import StarReader
 from bayesdist.app.config import MatchesConfig, parse_config
 from bayesdist.app.config.assess import RequirementBlock
-from bayesdist.app.kinds.fit_data import StarReader
 from bayesdist.app.kinds.matches.stars import read_stars
-from bayesdist.app.pipeline import diagnose, sample
+from bayesdist.app.pipeline import diagnose, evaluate, sample
 from bayesdist.app.python_terms import in_python_terms
 from bayesdist.app.rehearsal import rehearse
-from bayesdist.app.results import Results
 from bayesdist.app.run import Run
 from bayesdist.app.run_folder import MATCHES_FILE
 from bayesdist.app.screen import progress_bar
-from bayesdist.app.stages import evaluated
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess import Requirement, UserTerm
 from bayesdist.assess.requirements.requirement import as_requirements
@@ -211,12 +209,9 @@ def calibrate(
         )
     if stars is None:
         stars = read_stars(config, Path.cwd())
-    results = Results(
-        RunDirectory.unsaved(config, text, files=_is_path(matches)),
-        StarReader(config.resources()),
-        made={"inputs": stars},
-    )
-    return Run(_calibrated(results, progress))
+    directory = RunDirectory.unsaved(config, text, files=_is_path(matches))
+    run = Run(directory, StarReader(config.resources()), made={"inputs": stars})
+    return _calibrated(run, progress)
 
 
 def _checked(settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -242,16 +237,12 @@ def _checked(settings: Mapping[str, Any]) -> dict[str, Any]:
     return checked
 
 
-def _calibrated(results: Results, progress: bool) -> Results:
-    """Results with fit, posterior, diagnostics and evaluation."""
-    config = results.config
-    results = rehearse(results)
+def _calibrated(run: Run, progress: bool) -> Run:
+    """Run with fit, posterior, diagnostics and evaluation."""
+    run = rehearse(run)
     with progress_bar("sample") if progress else nullcontext() as update:
-        posterior = sample(results.data, config, progress=update)
-    results = results.having(posterior=posterior)
-    diagnostics = diagnose(results.posterior, results.data, config, results.base)
-    results = results.having(stored=diagnostics)
-    return results.having(evaluation=evaluated(results))
+        run = sample(run, progress=update)
+    return evaluate(diagnose(run))
 
 
 def _is_path(matches: Any) -> bool:

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 from pydantic import TypeAdapter
 
-from bayesdist.app.kinds.fitted import FIT_AGAIN
-from bayesdist.app.kinds.parts import TABLES, read_tables
+from bayesdist.app.artefacts.parts import TABLES, read_tables
+from bayesdist.app.artefacts.stored_fit import FIT_AGAIN
 from bayesdist.app.products.made_files import with_facts_of_run
-from bayesdist.app.results import open_results
+from bayesdist.app.run import Run
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.store.summary import Summary
 from bayesdist.assess.comparison.compare import NOISE_SEED, Comparison, compare
@@ -255,8 +255,8 @@ def _as_assessed(folder: Path) -> Solution:
         return load_posterior(folder)
     run = RunDirectory(folder)
     run.require("calibration", ("fit", "sample", "diagnose"))
-    with open_results(run) as results:
-        return results.solution
+    with Run.of(run) as opened:
+        return opened.solution
 
 
 def on_the_sky(path: Path, found: Calibration) -> Calibration:

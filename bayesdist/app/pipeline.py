@@ -1,129 +1,79 @@
-"""Functions of a calibration in Python: the steps of `bayesdist run`, without a run directory.
+"""Steps of a calibration in Python, as functions of a run.
 
-The steps follow a configuration, and paths in it are relative to `base`::
+The steps follow a configuration, and paths in it are relative to `base`; nothing is written except
+by `export` and `report`::
 
-config, _ = load_config("job/config.toml") base = Path("job") data = fit(match(read(config, base),
-config), config, base) posterior = sample(data, config) found = diagnose(posterior, data, config,
-base) errors = error_model(posterior, found, data, config) evaluation = evaluate(errors, posterior,
-found, data, config, base) export(evaluation, posterior, found, data, config, base,
-Path("products"))
+    config, text = load_config("job/config.toml")
+    run = Run.of(RunDirectory.unsaved(config, text, files=True, base=Path("job")))
+    run = evaluate(diagnose(sample(fit(match(run)))))
+    export(run, Path("products"))
 
 The results are identical to those of `bayesdist run` with the same configuration, which calls these
-functions in `bayesdist.app.stages.make_stages` and writes their results.  A `report` shows the
-`Results` of a run's folder (`bayesdist.app.results`).
+functions in `bayesdist.app.stages.make_stages` and writes their results.  A `report` shows a run
+that is in a folder.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
-from bayesdist.app.assessment.checks import run_checks
-from bayesdist.app.assessment.diagnosing import diagnose_run as diagnose
-from bayesdist.app.assessment.error_terms import assessment_rng, evaluation_settings
-from bayesdist.app.assessment.error_terms import errors_of_run as error_model
-from bayesdist.app.config import Config
-from bayesdist.app.kinds.fit_data import FitData, StarReader
-from bayesdist.app.kinds.kind import kind_of
-from bayesdist.app.kinds.matched import Matched
+from bayesdist.app.assessment.diagnosing import diagnostics_of_run
+from bayesdist.app.assessment.evaluating import evaluation_of_run
 from bayesdist.app.products.export import export
-from bayesdist.app.products.made_files import product_input, solution_of
-from bayesdist.app.products.product_terms import file_errors
 from bayesdist.app.report import report
-from bayesdist.assess import evaluation as assessed
-from bayesdist.assess.model import ErrorModel
-from bayesdist.diagnose.diagnostics import Diagnostics
-from bayesdist.infer import Posterior
+from bayesdist.app.run import Run
 
-__all__ = [
-    "diagnose",
-    "error_model",
-    "evaluate",
-    "export",
-    "fit",
-    "match",
-    "read",
-    "report",
-    "sample",
-]
+__all__ = ["diagnose", "evaluate", "export", "fit", "match", "report", "sample"]
 
 
-def read(config: Config, base: Path) -> Any:
-    """Read the inputs of a run, and refuse those that cannot be used.
-
-    Parameters
-    ----------
-    config : Config
-    base : Path
-        Folder that file names are relative to.
-
-    Returns
-    -------
-    Matches or Inputs
-        Matched stars, or star lists with their catalogue and log, depending on the kind of run.
-
-    Raises
-    ------
-    InputError
-        If the inputs cannot be read or are inconsistent.
-    """
-    kind = kind_of(config)
-    inputs = kind.read(config, base)
-    kind.refuse(inputs)
-    return inputs
-
-
-def match(inputs: Any, config: Config) -> Matched:
+def match(run: Run) -> Run:
     """Match stars, and divide them into fitted and held-out stars.
 
     Parameters
     ----------
-    inputs : Matches or Inputs
-        Inputs returned by `read`.
-    config : Config
+    run : Run
 
     Returns
     -------
-    Matched
+    Run
+        With `stars` and `held_stars`.
+
+    Raises
+    ------
+    InputError
+        If the inputs are inconsistent.
     """
-    return kind_of(config).match(inputs, config)
+    run.kind.refuse(run.inputs)
+    return run.kind.match(run)
 
 
-def fit(matched: Matched, config: Config, base: Path, reader: StarReader | None = None) -> FitData:
+def fit(run: Run) -> Run:
     """Fit by least squares.
 
     Parameters
     ----------
-    matched : Matched
-    config : Config
-    base : Path
-        Folder that file names are relative to.
-    reader : StarReader, optional
-        Reader that may already hold the stars.
+    run : Run
 
     Returns
     -------
-    FitData
-        The solution with its stars.
+    Run
+        With `fit`, and the `matches` that it used.
     """
-    reader = reader or StarReader(config.resources())
-    return FitData(matched, kind_of(config).fit(matched, config, base, reader), reader)
+    return run.kind.fit(run)
 
 
 def sample(
-    data: FitData,
-    config: Config,
+    run: Run,
     *,
     folder: Path | None = None,
     progress: Callable[[int, int], None] | None = None,
-) -> Posterior:
+) -> Run:
     """Sample the posterior of a fit.
 
     Parameters
     ----------
-    data : FitData
-    config : Config
+    run : Run
     folder : Path, optional
         Folder for checkpoints.
     progress : callable, optional
@@ -131,53 +81,37 @@ def sample(
 
     Returns
     -------
-    Posterior
+    Run
+        With `posterior`.
     """
-    return kind_of(config).sample(data, config, folder=folder, progress=progress)
+    return run.having(posterior=run.kind.sample(run, folder=folder, progress=progress))
 
 
-def evaluate(
-    errors: ErrorModel,
-    posterior: Posterior,
-    found: Diagnostics,
-    data: FitData,
-    config: Config,
-    base: Path,
-    *,
-    source: str = "",
-    series: Mapping[str, Any] | None = None,
-) -> assessed.Evaluation:
+def diagnose(run: Run) -> Run:
+    """Test the residuals, and the held-out stars.
+
+    Parameters
+    ----------
+    run : Run
+
+    Returns
+    -------
+    Run
+        With `diagnostics`.
+    """
+    return run.having(diagnostics=diagnostics_of_run(run))
+
+
+def evaluate(run: Run) -> Run:
     """Evaluate maps, budget, margins and validity periods.
 
     Parameters
     ----------
-    errors : ErrorModel
-    posterior : Posterior
-    found : Diagnostics
-    data : FitData
-    config : Config
-    base : Path
-        Folder that file names are relative to.
-    source : str
-        Origin of the solution that files state; the detector by default.
-    series : mapping, optional
-        Section 'time_dependence' of summary.json.
+    run : Run
 
     Returns
     -------
-    Evaluation
+    Run
+        With `evaluation`.
     """
-    solution = solution_of(posterior, found, data.fitted)
-    product = product_input(solution, data, config, source)
-    return assessed.evaluate(
-        errors,
-        found,
-        config.requirements(),
-        evaluation_settings(data, config),
-        assessment_rng(config),
-        fit=data.fit,
-        solution=solution,
-        checks=run_checks(data, posterior, found, config, series),
-        files=file_errors(product, config, base),
-        null=kind_of(config).null_space(data),
-    )
+    return run.having(evaluation=evaluation_of_run(run))

@@ -10,7 +10,8 @@ from typing import Any
 
 from bayesdist.app.calibrations import difference_from_previous
 from bayesdist.app.config import Config
-from bayesdist.app.results import Results
+from bayesdist.app.products.made_files import product_of_run
+from bayesdist.app.run import Run
 from bayesdist.app.store import as_json
 from bayesdist.assess.comparison.compare import Comparison
 from bayesdist.assess.evaluation import Evaluation
@@ -25,29 +26,29 @@ from bayesdist.utils.checks import Check
 log = logging.getLogger("bayesdist")
 
 
-def report(results: Results, *, pdf: bool = False) -> list[str]:
+def report(run: Run, *, pdf: bool = False) -> list[str]:
     """Write the report to the folder of the run, and return the names of its figures."""
     # imported here because plotting takes seconds to import
     from bayesdist.report.drawing import save_drawings
     from bayesdist.report.run_report import draw_report, write_report
     from bayesdist.report.sections.run.status import verdict
 
-    run, inputs = results.run, report_input(results)
+    inputs, directory = report_input(run), run.directory
     drawings = draw_report(inputs, pdf=pdf, processes=2 if _is_command_line() else 1)
-    names = [path.name for path in save_drawings(drawings, run / "figures")]
-    write_report(run / "report.html", inputs, drawings)
+    names = [path.name for path in save_drawings(drawings, directory / "figures")]
+    write_report(directory / "report.html", inputs, drawings)
     overall = verdict(inputs)
-    run.summarise(verdict={"level": overall.level, "headline": overall.headline})
-    log.info("report: %s", run / "report.html")
+    directory.summarise(verdict={"level": overall.level, "headline": overall.headline})
+    log.info("report: %s", directory / "report.html")
     return names
 
 
-def write_html_report(results: Results, path: Path) -> None:
+def write_html_report(run: Run, path: Path) -> None:
     """Write the report of a run to one HTML file.
 
     Parameters
     ----------
-    results : Results
+    run : Run
     path : pathlib.Path
 
     Raises
@@ -57,7 +58,7 @@ def write_html_report(results: Results, path: Path) -> None:
     """
     from bayesdist.report.run_report import draw_report, render_report
 
-    inputs = report_input(results)
+    inputs = report_input(run)
     text = render_report(inputs, draw_report(inputs))
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
@@ -70,25 +71,25 @@ def _is_command_line() -> bool:
     return name == "bayesdist" and (os.cpu_count() or 1) > 1
 
 
-def report_input(results: Results) -> ReportInput:
+def report_input(run: Run) -> ReportInput:
     """Content of the report, from the artefacts of a run."""
-    run, config, fitted = results.run, results.config, results.fitted
-    fit, posterior, solution = results.fit, results.posterior, results.solution
-    diagnostics, evaluation, epoch = results.diagnostics, results.evaluation, results.epoch
-    facts, folder = run.facts, run.path.resolve().name
+    directory, config, solution = run.directory, run.config, run.solution
+    diagnostics, evaluation = run.diagnostics, run.evaluation
+    facts, folder = directory.facts, directory.path.resolve().name
     products = tuple(
-        Product(p["path"], p["kind"], _product_checks(p)) for p in run.summary.get("products", [])
+        Product(p["path"], p["kind"], _product_checks(p))
+        for p in directory.summary.get("products", [])
     )
     return ReportInput(
         name=title_of(config) or folder,
         config=as_json(config.model_dump(exclude_none=True)),
         stars=diagnostics.sample,
         exposures=diagnostics.sums.exposures,
-        fit=fit,
-        posterior=posterior,
-        chips=_chip_results(solution, diagnostics, evaluation, epoch),
-        coefficients=coefficient_table(fit, solution),
-        previous=_difference_from_previous(results),
+        fit=run.fit,
+        posterior=run.posterior,
+        chips=_chip_results(solution, diagnostics, evaluation, run.epoch),
+        coefficients=coefficient_table(run.fit, solution),
+        previous=_difference_from_previous(run),
         budget=evaluation.budget,
         surface=evaluation.surface,
         margins=evaluation.margins,
@@ -98,26 +99,24 @@ def report_input(results: Results) -> ReportInput:
         score_tests=diagnostics.score_tests,
         periods=diagnostics.periods,
         held_out=diagnostics.holdout,
-        magnitude_errors=fitted.errors.by_magnitude,
-        added_errors=fitted.grouped,
+        magnitude_errors=run.errors.by_magnitude,
+        added_errors=run.added_errors,
         flagged=diagnostics.flagged,
-        tables=fitted.tables.tables,
+        tables=run.tables.tables,
         provenance={"folder": folder}
         | {k: facts[k] for k in ("command", "created", "seed", "inputs", "versions")}
-        | {"stages": run.record.stages},
-        **results.kind.report_parts(run, results.data, posterior, diagnostics, epoch),
+        | {"stages": directory.record.stages},
+        **run.kind.report_parts(run),
     )
 
 
-def _difference_from_previous(results: Results) -> tuple[Comparison, ...]:
+def _difference_from_previous(run: Run) -> tuple[Comparison, ...]:
     """Difference from the release that the run replaces, by chip; empty if none is named."""
-    previous = results.config.products.previous
+    previous = run.config.products.previous
     if previous is None:
         return ()
-    product = results.product
-    return difference_from_previous(
-        product.calibration, results.base / previous, product.options.epoch
-    )
+    product = product_of_run(run)
+    return difference_from_previous(product.calibration, run.base / previous, product.options.epoch)
 
 
 MOST_NAMED = 3  # largest number of chips named in a title

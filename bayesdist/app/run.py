@@ -5,63 +5,77 @@ from __future__ import annotations
 import os
 import tempfile
 import webbrowser
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self, TypeAlias
+from typing import TYPE_CHECKING, Any, Self, TypeAlias, TypeVar
 
 import numpy as np
-from astropy.table import Table
 
-from bayesdist.app.products.made_files import with_facts_of_run
-from bayesdist.app.python_terms import in_python_terms, python_terms
-from bayesdist.app.report import title_of, write_html_report
-from bayesdist.app.results import Results, errors_of, margins_of, results_of
-from bayesdist.app.run_folder import copy_run, save_run
-from bayesdist.app.stages import evaluated
-from bayesdist.app.stages import run as run_configuration
+from bayesdist.app import hooks
+from bayesdist.app.artefacts.errors import QUOTED, ErrorLaw
+from bayesdist.app.artefacts.parts import NO_TABLES, Part, StoredLookupTables
+from bayesdist.app.artefacts.reader import RunInput, StarReader
+from bayesdist.app.python_terms import python_terms
 from bayesdist.app.store.rundir import RunDirectory
+from bayesdist.app.tables.result_files import load_diagnostics, load_evaluation
 from bayesdist.assess import ErrorBudget, Margin, Requirement, UncertaintyMap
-from bayesdist.assess.budget import budget_of, place_budget
 from bayesdist.assess.drawn import DrawnErrors
-from bayesdist.assess.evaluation import Evaluation, position_map
+from bayesdist.assess.evaluation import Evaluation, EvaluationSettings
+from bayesdist.assess.model import ErrorModel, with_diagnosed_errors
 from bayesdist.assess.requirements.requirement import as_requirements
-from bayesdist.assess.requirements.verdict import VERDICT_LEVELS
-from bayesdist.calibration.calibration import Calibration, calibration_of_exposure
-from bayesdist.calibration.chip_map import chosen_chip
-from bayesdist.calibration.sky_positions import sky_distribution
-from bayesdist.calibration.sky_table import pixel_columns, position_column
-from bayesdist.data import Matches
+from bayesdist.calibration.calibration import Calibration
+from bayesdist.data import Matches, ReferenceCatalog
 from bayesdist.diagnose.diagnostics import Diagnostics
+from bayesdist.diagnose.residuals.misfit import error_scale_sentence
+from bayesdist.diagnose.residuals.stars import dates_of
 from bayesdist.errors import InputError
-from bayesdist.infer import LinearFit, Posterior
+from bayesdist.infer import GaussianPriors, LinearFit, Posterior, Shards, load_posterior
+from bayesdist.infer.catalogue.added_errors import GroupedErrors
 from bayesdist.model import DistortionModel
+from bayesdist.plugin import load_object
 from bayesdist.products.registry import format_of
-from bayesdist.report.html import (
-    RunSummary,
-    budget_rows,
-    margin_rows,
-    summary_html,
-    summary_text,
-)
-from bayesdist.utils.checks import warnings_of
-from bayesdist.utils.numbers import number, with_mas
-from bayesdist.utils.quantities import Number, Random, value_in, values_in, whole_number, year_of
+from bayesdist.utils.arrays import Float
+from bayesdist.utils.checks import Check, warnings_of
+from bayesdist.utils.quantities import Number, Random, whole_number
 
 if TYPE_CHECKING:
     from astropy.coordinates import SkyCoord
     from astropy.modeling import Model
-    from astropy.table import QTable
+    from astropy.table import QTable, Table
     from xarray import DataTree
 
     from bayesdist.app.config import Config
+    from bayesdist.app.kinds.kind import RunKind
     from bayesdist.calibration.wcs import CalibrationWCS
     from bayesdist.report.run_plots import RunPlots
 
-__all__ = ["Run", "open_run", "run"]
+__all__ = ["Run"]
 
 Positions: TypeAlias = tuple[float, float] | Sequence[tuple[float, float]]
+P = TypeVar("P", bound=Part)
+T = TypeVar("T")
+
+# artefacts by the stage that makes them, in order, with what follows from them and is kept with
+# them; artefacts of later stages depend on those of earlier ones
+STAGES: Mapping[str, tuple[str, ...]] = {
+    "read": ("config", "kind", "inputs"),
+    "match": (
+        *("stars", "held_stars", "held_exposures"),
+        *("match_facts", "match_table", "match_parts", "_matched"),
+    ),
+    "fit": (
+        *("fit", "errors", "priors", "added_errors", "parts", "fit_facts", "_fitted"),
+        *("placed", "matches", "held_out", "dates", "last_epoch"),
+    ),
+    "sample": ("posterior",),
+    "diagnose": ("diagnostics", "stored_diagnostics", "solution", "error_model"),
+    "evaluate": ("evaluation",),
+    "export": ("products",),
+    "report": ("figures",),
+}
+ORDER = {name: place for place, names in enumerate(STAGES.values()) for name in names}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -69,12 +83,19 @@ class Run:
     """Everything known about one calibration: stars, model, posterior, diagnostics, evaluation.
 
     A run is made by `bayesdist.calibrate` or `bayesdist.run`, or opened with `bayesdist.open_run`.
-    It may be used as a context manager, which closes it.
+    It may be used as a context manager, which closes it.  Artefacts are made by the stages of a
+    run, or loaded from its folder when they are first used.
 
     Parameters
     ----------
-    results : Results
-        Artefacts of the run.
+    directory : RunDirectory
+        Folder of the run with its configuration and record; it may be one in memory.
+    reader : StarReader
+        Cache of the stars, which all stages share.
+    made : mapping of str to object
+        Artefacts made by this process, which replace those in the folder.
+    source : RunInput, optional
+        Matches in the format of a mission, which may have to be selected before they are read.
 
     Examples
     --------
@@ -89,71 +110,77 @@ class Run:
     'undecided'
     """
 
-    results: Results
+    directory: RunDirectory
+    reader: StarReader
+    made: Mapping[str, Any] = field(default_factory=dict)
+    source: RunInput | None = None
 
     # -- content ----------------------------------------------------------------------------------
 
-    @property
+    @cached_property
     def config(self) -> Config:
         """Resolved configuration."""
-        return self.results.config
+        return self.directory.config
 
     @property
     def folder(self) -> Path | None:
         """Folder of the run; None if it is in memory."""
-        return None if self.results.run.in_memory else self.results.run.path
+        return None if self.directory.in_memory else self.directory.path
 
-    @property
+    @cached_property
     def matches(self) -> Matches:
-        """Stars of the fit, with the errors that it used."""
-        return self.results.data.stars
+        """Stars of the fit at the pixels that it used, with the errors that it assumed."""
+        return self.reader.matches(self.placed, self._remaining_errors)
 
-    @property
+    @cached_property
     def held_out(self) -> Matches | None:
-        """Stars that were set aside to test the result; None if there are none."""
-        return self.results.data.held
+        """Stars that were set aside to test the result, as `matches`; None if there are none."""
+        held = self.held_stars
+        return None if held is None else self.errors.applied(self.as_placed(held))
 
     @property
     def model(self) -> DistortionModel:
         """Structure and parameter layout of the distortion."""
-        return self.results.fit.model
+        return self.fit.model
 
     @property
     def fit(self) -> LinearFit:
         """Least-squares fit, with formal errors."""
-        return self.results.fit
+        fit: LinearFit = self._fitted["fit"]
+        return fit
 
-    @property
+    @cached_property
     def posterior(self) -> Posterior:
         """Posterior as it was sampled, under the assumptions of its likelihood."""
-        return self.results.posterior
+        return self._artefact(
+            "posterior", "sample", lambda: load_posterior(self.directory / "posterior.nc")
+        )
 
-    @property
+    @cached_property
     def solution(self) -> Posterior:
         """Posterior with the errors that the diagnostics found added; it is written to files."""
-        return self.results.solution
+        return with_diagnosed_errors(self.posterior, self.stored_diagnostics, self.hierarchy)
 
-    @property
+    @cached_property
     def diagnostics(self) -> Diagnostics:
-        """Results of the tests of the residuals."""
-        return self.results.diagnostics
+        """Results of the tests of the residuals; of the fit alone if nothing was sampled."""
+        stored = self.stored_diagnostics if self.is_sampled else None
+        if stored is not None:
+            return stored
+        diagnostics: Diagnostics = load_object(hooks.DIAGNOSE)(self)
+        return diagnostics
 
     @cached_property
     def evaluation(self) -> Evaluation:
         """Maps, budget, margins, validity periods and checks."""
-        return self.results.stored_evaluation or evaluated(self.results)
+        evaluation: Evaluation = self.stored_evaluation or load_object(hooks.EVALUATE)(self)
+        return evaluation
 
     @cached_property
     def calibration(self) -> Calibration:
         """Calibration of the detector as it is written to files, with all errors of positions."""
-        results, correlated = self.results, self.diagnostics.correlated
-        return with_facts_of_run(
-            results.product.calibration,
-            results.config,
-            results.fitted.tables.tables,
-            self.evaluation.budget.rows(),
-            None if correlated is None else correlated.facts,
-        )
+        calibration: Calibration = load_object(hooks.CALIBRATION)(self)
+        return calibration
 
     @property
     def converged(self) -> bool:
@@ -208,35 +235,10 @@ class Run:
             If a position is off the chip, the chip is unknown or not given, or `to` is given
             without one position `at`.
         """
-        if to is not None and (at is None or len(_pairs(at, "at")) != 1):
-            raise InputError(
-                "a separation is measured from one position", where="budget", do="give at=(x, y)"
-            )
-        if magnitude is not None:
-            magnitude = value_in(magnitude, "mag", "magnitude", where="budget")
-        date = None if epoch is None else year_of(epoch)
-        if at is None:
-            if date is None and magnitude is None:
-                return self.evaluation.budget
-            domain = self.results.settings.domain(self.results.errors)
-            domain = replace(domain, magnitude=magnitude)
-            return budget_of(self._drawn, domain if date is None else domain.at(date))
-        points = [*_pairs(at, "at"), *([] if to is None else _pairs(to, "to"))]
-        x, y = zip(*points, strict=True)
-        return place_budget(
-            self._drawn,
-            x,
-            y,
-            chip=self._chip(chip),
-            epoch=self.results.epoch if date is None else date,
-            magnitude=magnitude,
-            relative=to is not None,
+        budget: ErrorBudget = load_object(hooks.BUDGET)(
+            self, at=at, to=to, chip=chip, epoch=epoch, magnitude=magnitude
         )
-
-    @cached_property
-    def _drawn(self) -> DrawnErrors:
-        """Draws of all errors of a position."""
-        return errors_of(self.results)
+        return budget
 
     @python_terms
     def check(
@@ -260,7 +262,10 @@ class Run:
         """
         if requirements is None:
             return self.margins
-        return margins_of(self.results, as_requirements(requirements))
+        margins: tuple[Margin, ...] = load_object(hooks.MARGINS)(
+            self, as_requirements(requirements)
+        )
+        return margins
 
     @python_terms
     def map(self, *, chip: int | None = None, epoch: Any = None) -> UncertaintyMap:
@@ -282,38 +287,16 @@ class Run:
         InputError
             If the chip is unknown or not given.
         """
-        number = self._chip(chip)
-        date = None if epoch is None else year_of(epoch)
-        if date is None:
-            return next(item for item in self.evaluation.maps if item.chip == number)
-        results = self.results
-        settings = replace(results.settings, epoch=date)
-        chip_of_map = next(item for item in self.model.chips if item.number == number)
-        return position_map(results.errors, results.solution, settings, chip_of_map)
-
-    def _chip(self, number: int | None) -> int:
-        """Number of a chip of the model; it has to be given if there are several."""
-        numbers = [chip.number for chip in self.model.chips]
-        return chosen_chip(numbers, number, where=str(self.folder or "the run"))
+        chip_map: UncertaintyMap = load_object(hooks.MAP)(self, chip, epoch)
+        return chip_map
 
     # -- objects of other packages ----------------------------------------------------------------
 
     @property
     def plot(self) -> RunPlots:
         """Plots of the run: ``run.plot.map()``, ``run.plot.residuals()``, and others."""
-        from bayesdist.report.run_plots import RunPlots  # matplotlib is only loaded for plots
-
-        results = self.results
-        return RunPlots(
-            fit=self.fit,
-            posterior=self.posterior,
-            diagnostics=self.diagnostics,
-            evaluation=self.evaluation,
-            solution=self.solution,
-            scale_mas=results.config.detector.scale_mas,
-            magnitude_errors=results.fitted.errors.by_magnitude,
-            rows=results.kind.rows,
-        )
+        plots: RunPlots = load_object(hooks.PLOT)(self)
+        return plots
 
     @python_terms
     def wcs(
@@ -350,41 +333,8 @@ class Run:
         InputError
             If there is no such chip or exposure, or a position on the sky is needed and not given.
         """
-        date = self._date(exposure, epoch)
-        if exposure is None:
-            return self.calibration.wcs(chip, epoch=date, **sky)
-        plain = self.calibration
-        of_exposure = calibration_of_exposure(
-            self.solution,
-            exposure,
-            epoch=date,
-            plane=replace(plain.plane, note=""),
-            detector=plain.detector,
-            filter=plain.filter,
-            scale=None if plain.scale is None else (plain.scale, plain.scale_from),
-        )
-        of_exposure = replace(
-            of_exposure,
-            further=plain.further,
-            before=plain.before,
-            after=plain.after,
-            pixel_mas=plain.pixel_mas,
-        )
-        return of_exposure.wcs(chip, **sky)
-
-    def _date(self, exposure: str | None, epoch: Any) -> float | None:
-        """Decimal year of a calibration; None if the model does not depend on time."""
-        date = None if epoch is None else year_of(epoch)
-        if self.model.time is None:
-            return None
-        if date is not None:
-            return date
-        stars = self.results.data.sample
-        if exposure in stars.exposure_names and stars.epoch is not None:
-            rows = stars.exposure == stars.exposure_names.index(exposure)
-            if rows.any():
-                return float(stars.epoch[rows].mean())
-        return self.results.epoch
+        wcs: CalibrationWCS = load_object(hooks.WCS)(self, chip, exposure, epoch, **sky)
+        return wcs
 
     @python_terms
     def to_model(self, chip: int | None = None, *, epoch: Any = None, **sky: Any) -> Model:
@@ -419,80 +369,12 @@ class Run:
     # -- representations --------------------------------------------------------------------------
 
     def __repr__(self) -> str:
-        return summary_text(self._summary)
+        text: str = load_object(hooks.TEXT)(self)
+        return text
 
     def _repr_html_(self) -> str:
-        return summary_html(self._summary)
-
-    @property
-    def _summary(self) -> RunSummary:
-        """Content of the representations of a run: verdicts, warnings, a few facts."""
-        evaluation, fit, config = self.evaluation, self.fit, self.results.config
-        convergence = self.posterior.convergence
-        scale_mas = config.detector.scale_mas
-        largest = max(float(np.nanmax(chip_map.per_axis)) for chip_map in evaluation.maps)
-        exposures = len(self.results.data.placed.exposures)
-        state = f"yes, R-hat {convergence.rhat_max:.3f}, ESS {convergence.ess_bulk_min:.0f}"
-        facts = [
-            (self.results.kind.rows.capitalize(), f"{fit.n_rows}, {fit.n_used} used in the fit"),
-            ("Exposures", str(exposures)),
-            ("Model", f"order {fit.model.order}, {fit.model.n_params} parameters"),
-            ("Converged", state if self.converged else f"NO: {'; '.join(convergence.reasons)}"),
-            ("Largest uncertainty per axis", with_mas(largest, fit.unit, scale_mas)),
-        ]
-        if self.results.fitted.errors.by_magnitude is not None:
-            facts.insert(1, ("Errors", "estimated from the residuals by magnitude"))
-        if self.folder is not None:
-            facts.append(("Folder", str(self.folder)))
-        not_shown = [
-            f"{m.requirement.name}: not shown: {m.reason}"
-            for m in self.margins
-            if m.verdict == "not shown"
-        ]
-        return RunSummary(
-            title=title_of(config) or "calibration",
-            verdict_level=self._level,
-            headline=self._headline,
-            warnings=(*self.warnings, *not_shown),
-            facts=facts,
-            margins_rows=margin_rows(self.margins),
-            budget_rows=budget_rows(evaluation.budget, scale_mas=scale_mas),
-        )
-
-    @property
-    def _level(self) -> str:
-        """Level of the worst margin or check; 'note' if all is well and nothing was required."""
-        level = self.evaluation.verdict[0] if self.converged else "fail"
-        return "note" if level == "pass" and not self.margins else level
-
-    @property
-    def _headline(self) -> str:
-        """Verdict in words, with the number of requirements that each verdict is given to."""
-        if not self.converged:
-            return "Not converged: no number of this run can be relied on"
-        if not self.margins:
-            return "No requirement was given"
-        verdicts = [margin.verdict for margin in self.margins]
-        if len(verdicts) == 1:
-            return self._verdict_words(self.margins[0])
-        counts = [(verdicts.count(name), name) for name in reversed(VERDICT_LEVELS)]
-        return f"{len(verdicts)} requirements: " + ", ".join(
-            f"{count} {name}" for count, name in counts if count
-        )
-
-    def _verdict_words(self, margin: Margin) -> str:
-        """Verdict on a requirement with value, limit and probability."""
-        asked, row = margin.requirement, margin_rows([margin])[0]
-        statistic = f"{asked.statistic} {asked.scope}".strip()
-        scale_mas = self.results.config.detector.scale_mas
-        value = f"{row['Value']} {margin.unit}"
-        if margin.unit == "pix" and scale_mas is not None:
-            value += f" ({number(margin.value * scale_mas, 3)} mas)"
-        qualifier = " by the known errors alone" if margin.verdict == "undecided" else ""
-        return (
-            f"{margin.verdict.upper()}: {asked.name}: {statistic} {value}, "
-            f"limit {asked.limit:g} {asked.unit}, {margin.probability_words}{qualifier}"
-        )
+        text: str = load_object(hooks.HTML)(self)
+        return text
 
     @python_terms
     def to_sky(
@@ -522,33 +404,10 @@ class Run:
         InputError
             If u and v do not lie on the sky, or columns or chips are unknown.
         """
-        if self.model.time is not None:
-            options = {"epoch": self.results.epoch} | options
         if draws is not None:
             draws = whole_number(draws, "draws", least=2, where="to_sky")
-        positions = self.calibration.to_sky(table, **options)
-        if draws is None:
-            return positions
-        rows = Table(positions)
-        origin = positions.meta["pixel_origin"]
-        x, y, _, _ = pixel_columns(rows, options.get("columns"), origin, "table")
-        centroids = options.get("centroids")
-        if centroids is not None:
-            centroids = tuple(position_column(rows, name, "table") for name in centroids)
-        chip = options.get("chip")
-        if chip is None and "chip" in positions.colnames:
-            chip = np.asarray(positions["chip"])
-        return sky_distribution(
-            self.calibration,
-            x,
-            y,
-            n_draws=draws,
-            rng=rng,
-            chip=chip,
-            epoch=options.get("epoch"),
-            point=options.get("point"),
-            centroids=centroids,
-        )
+        positions: QTable | SkyCoord = load_object(hooks.TO_SKY)(self, table, draws, rng, **options)
+        return positions
 
     # -- files ------------------------------------------------------------------------------------
 
@@ -583,7 +442,7 @@ class Run:
             As for `Calibration.write`.
         """
         if self.model.time is not None and not format_of(format).holds_time:
-            settings = {"epoch": self.results.epoch} | settings
+            settings = {"epoch": self.epoch} | settings
         return self.calibration.write(format, file, **settings)
 
     @python_terms
@@ -604,7 +463,7 @@ class Run:
         InputError
             If the file cannot be written.
         """
-        write_html_report(self.results, Path(path))
+        load_object(hooks.REPORT)(self, Path(path))
         return Path(path)
 
     def show(self) -> None:
@@ -631,16 +490,14 @@ class Run:
         InputError
             If the folder is not empty, or files that the run was made from have changed.
         """
-        folder = Path(folder)
-        if self.results.run.in_memory:
-            save_run(self.results, folder)
-        else:
-            copy_run(self.results.run, folder)
-        return folder
+        load_object(hooks.SAVE)(self, Path(folder))
+        return Path(folder)
 
     def close(self) -> None:
-        """Release the stars, and the processes that hold them."""
-        self.results.close()
+        """Release the stars, and the processes that hold them; remove temporary files."""
+        self.reader.close()
+        if self.source is not None:
+            self.source.close()
 
     def __enter__(self) -> Self:
         return self
@@ -648,132 +505,323 @@ class Run:
     def __exit__(self, *_: object) -> None:
         self.close()
 
+    # -- stages -----------------------------------------------------------------------------------
 
-@in_python_terms(keys=False)
-def open_run(folder: str | os.PathLike[str]) -> Run:
-    """Open a run that is in a folder.
+    @classmethod
+    def of(cls, directory: RunDirectory) -> Run:
+        """Run of a directory; the caller must close it."""
+        source: RunInput | None = load_object(hooks.SOURCE)(directory)
+        return cls(directory, StarReader(directory.config.resources()), source=source)
 
-    Parameters
-    ----------
-    folder : path-like
+    def having(self, **artefacts: Any) -> Run:
+        """Run with the artefacts of a stage replaced, by name.
 
-    Returns
-    -------
-    Run
-        Its parts are read when they are first used.
+        Other artefacts of this stage and those of later stages are dropped.
+        """
+        unknown = artefacts.keys() - ORDER
+        if unknown:
+            raise LookupError(f"no artefact of a run: {', '.join(sorted(unknown))}")
+        first = min(ORDER[name] for name in artefacts)
+        made = {name: value for name, value in self.made.items() if ORDER[name] < first}
+        run = replace(self, made={**made, **artefacts})
+        # what was loaded or derived before
+        vars(run).update((n, v) for n, v in vars(self).items() if ORDER.get(n, first) < first)
+        return run
 
-    Raises
-    ------
-    InputError
-        If the folder holds no run, the run has not been sampled, or its inputs have changed.
+    def adopting_inputs(self) -> Run:
+        """Run with inputs moved into its folder, if they were prepared elsewhere."""
+        if self.source is None or not self.source.move_into_run():
+            return self
+        fitted = {name: self.made[name] for name in STAGES["fit"] if name in self.made}
+        moved = self.having(inputs=self.source.load())
+        self.reader.moved(moved.stars)
+        return moved.having(**fitted)
 
-    Examples
-    --------
-    >>> chip = bd.Chip(1, "camera", (2048, 2048), (1024.5, 1024.5))
-    >>> model = bd.DistortionModel(1, (chip,), "pix")
-    >>> truth, rng = [0, 1000, 0, 0, 0, 1000], np.random.default_rng(1)
-    >>> stars, _ = bd.simulate_matches(model, truth, 500, sigma=0.01, rng=rng)
-    >>> folder = bd.calibrate(stars, order=1, size=(2048, 2048)).save("camera-run")
-    >>> bd.open_run("camera-run").model.order
-    1
-    """
-    directory = RunDirectory(Path(folder))
-    if not directory.is_initialized:
+    def with_config(self, config: Config) -> Run:
+        """Run of another configuration; artefacts that depend on the change must be made again."""
+        run = replace(
+            self, made={**self.made, "inputs": self.kind.with_config(self.inputs, config)}
+        )
+        kept = ORDER.keys() - {"inputs", "error_model"}
+        vars(run).update((name, value) for name, value in vars(self).items() if name in kept)
+        vars(run)["config"] = config
+        return run
+
+    def _artefact(self, name: str, stage: str, load: Callable[[], T]) -> T:
+        """Artefact made by this process, otherwise loaded from the folder if undamaged."""
+        if self.made.get(name) is not None:
+            artefact: T = self.made[name]
+            return artefact
+        self.directory.refuse_damaged(stage)
+        return load()
+
+    # -- inputs -----------------------------------------------------------------------------------
+
+    @cached_property
+    def base(self) -> Path:
+        """Folder that file names in the configuration are relative to."""
+        return self.directory.base
+
+    @cached_property
+    def kind(self) -> RunKind[Any, Any]:
+        """Kind of the run, which answers what differs between matches, campaigns and others."""
+        kind: RunKind[Any, Any] = load_object(self.config.kind)
+        return kind
+
+    @cached_property
+    def inputs(self) -> Any:
+        """Inputs of the run: matched stars, or star lists with what belongs to them."""
+        if "inputs" in self.made:
+            return self.made["inputs"]
+        if self.source is not None:
+            return self.source.load()
+        return self.kind.read(self.config, self.base)
+
+    # -- matches ----------------------------------------------------------------------------------
+
+    @cached_property
+    def _matched(self) -> Mapping[str, Any]:
+        """Artefacts of the stage 'match', made by this process or loaded."""
+        if "stars" in self.made:
+            return self.made
+        self.directory.refuse_damaged("match")
+        return self.kind.load_matched(self).made
+
+    @property
+    def stars(self) -> Matches:
+        """Stars to fit as they were matched, with quoted errors; `matches` as the fit used them."""
+        stars: Matches = self._matched["stars"]
+        return stars
+
+    @property
+    def held_stars(self) -> Matches | None:
+        """Held-out stars as they were matched; None if there are none."""
+        return self._matched.get("held_stars")
+
+    @property
+    def held_exposures(self) -> tuple[str, ...]:
+        """Names of exposures that are held out entirely."""
+        return self._matched.get("held_exposures", ())
+
+    @property
+    def match_facts(self) -> Mapping[str, Any]:
+        """Section of summary.json on the matching, which the kind names."""
+        return self._matched.get("match_facts", {})
+
+    @property
+    def match_table(self) -> Table | None:
+        """Matching of star lists, one row per exposure; None if it was not made now."""
+        return self._matched.get("match_table")
+
+    @property
+    def match_parts(self) -> Mapping[str, Part]:
+        """Results of the matching that only some kinds of runs have, by name."""
+        return self._matched.get("match_parts", {})
+
+    @property
+    def tangent_point(self) -> tuple[float, float] | None:
+        """RA and Dec of (u, v) = (0, 0) in degrees; None if u, v are not along the sky."""
+        return None if self.kind.along_detector else self.stars.tangent_point
+
+    @property
+    def catalogue(self) -> ReferenceCatalog | None:
+        """Reference catalogue; None if only the matches are known."""
+        return self.kind.catalogue(self)
+
+    @property
+    def catalogue_name(self) -> str:
+        """File name of the reference catalogue, or 'catalogue' if it is unknown."""
+        catalogue = self.catalogue
+        return "catalogue" if catalogue is None else Path(catalogue.source).name
+
+    @property
+    def filter(self) -> str:
+        """Filter of the exposures; empty if it has no name."""
+        return self.kind.filter(self)
+
+    # -- fit --------------------------------------------------------------------------------------
+
+    @cached_property
+    def _fitted(self) -> Mapping[str, Any]:
+        """Artefacts of the stage 'fit', made by this process or loaded."""
+        if "fit" in self.made:
+            return self.made
+        self.directory.refuse_damaged("fit")
+        return self.kind.load_fit(self).made
+
+    @property
+    def errors(self) -> ErrorLaw:
+        """Measurement errors of fitted and held-out stars that the fit assumed."""
+        return self._fitted.get("errors", QUOTED)
+
+    @property
+    def priors(self) -> GaussianPriors:
+        """Priors on the parameters."""
+        priors: GaussianPriors = self._fitted["priors"]
+        return priors
+
+    @property
+    def added_errors(self) -> GroupedErrors | None:
+        """Errors in addition to the quoted ones; None if no groups of stars were compared."""
+        return self._fitted.get("added_errors")
+
+    @property
+    def parts(self) -> Mapping[str, Part]:
+        """Results of the fit that only some kinds of runs have, by name."""
+        return self._fitted.get("parts", {})
+
+    @property
+    def fit_facts(self) -> Mapping[str, Any]:
+        """Sections of summary.json that are known only while the fit is made."""
+        return self._fitted.get("fit_facts", {})
+
+    def part(self, kind: type[P]) -> P:
+        """Part of the given class, which the kind of run has; raises InputError if it is absent."""
+        parts = self.match_parts if kind.stage == "match" else self.parts
+        for part in parts.values():
+            if isinstance(part, kind):
+                return part
         raise InputError(
-            "is no run: it has no run.json",
-            where=str(folder),
-            do="restore it, or make the run again with bayesdist.run",
+            f"has no {kind.title}",
+            where=str(self.directory.path),
+            do=f"run the stage '{kind.stage}' again",
         )
-    directory = RunDirectory.open(Path(folder))
-    directory.require("open_run", ("fit", "sample", "diagnose"))
-    return Run(results_of(directory))
 
+    @property
+    def tables(self) -> StoredLookupTables:
+        """Look-up tables with their errors; empty if the fit has none."""
+        tables = (part for part in self.parts.values() if isinstance(part, StoredLookupTables))
+        return next(tables, NO_TABLES)
 
-@in_python_terms(keys=False)
-def run(
-    config: str | os.PathLike[str],
-    folder: str | os.PathLike[str],
-    *,
-    resume: bool = False,
-    overwrite: bool = False,
-    seed: int | None = None,
-    report: bool = True,
-) -> Run:
-    """Make the run of a configuration file, as ``bayesdist run`` does.
+    @property
+    def hierarchy(self) -> LinearFit | None:
+        """The fit, if its exposures scatter about its solution; else None."""
+        return self.fit if any(part.is_hierarchy for part in self.parts.values()) else None
 
-    Parameters
-    ----------
-    config : path-like
-        TOML file; paths in it are relative to it.
-    folder : path-like
-        Folder of the run.
-    resume : bool
-        Resume the run that is in the folder.
-    overwrite : bool
-        Replace the run that is in the folder.
-    seed : int, optional
-        Seed in place of the configured one.
-    report : bool
-        False to leave out the report and its figures, which may take as long as everything else;
-        `Run.report` writes it at any time.
+    @property
+    def gauge_words(self) -> str:
+        """Sentence that states the gauge of the products; may be empty."""
+        return " ".join(filter(None, (part.gauge_sentence() for part in self.parts.values())))
 
-    Returns
-    -------
-    Run
+    @property
+    def _remaining_errors(self) -> ErrorLaw:
+        """Errors to apply to the stars that `as_placed` returns."""
+        return QUOTED if any(part.applies_errors for part in self.parts.values()) else self.errors
 
-    Raises
-    ------
-    InputError
-        If the configuration or its inputs cannot be used, or the folder holds something else.
+    def as_placed(self, stars: Matches) -> Matches:
+        """Stars at the positions that the fit has used, for example corrected by tables."""
+        for part in self.parts.values():
+            stars = part.placed(stars, self.model)
+        return stars
 
-    Examples
-    --------
-    >>> from pathlib import Path
-    >>> chip = bd.Chip(1, "camera", (2048, 2048), (1024.5, 1024.5))
-    >>> model = bd.DistortionModel(1, (chip,), "pix")
-    >>> truth, rng = [0, 1000, 0, 0, 0, 1000], np.random.default_rng(1)
-    >>> stars, _ = bd.simulate_matches(model, truth, 500, sigma=0.01, rng=rng)
-    >>> stars.to_table().write("stars.ecsv")
-    >>> config = '''
-    ... data = {matches = "stars.ecsv"}
-    ... detector = {size = [2048, 2048]}
-    ... model = {order = 1}
-    ... '''
-    >>> n = Path("camera.toml").write_text(config)
-    >>> bd.run("camera.toml", "camera-run", report=False).model.order
-    1
-    """
-    if (Path(folder) / "run.json").exists() and not (resume or overwrite):
-        raise InputError(
-            "the folder holds another run",
-            where=str(folder),
-            do="give resume=True or overwrite=True, or choose another folder",
+    @cached_property
+    def placed(self) -> Matches:
+        """Fitted stars at the positions that the fit has used, with their quoted errors."""
+        return self.as_placed(self.stars)
+
+    @property
+    def shards(self) -> Shards:
+        """All fitted stars, split into shards for passes over the data."""
+        return self.reader.shards(self.model, self.placed, self._remaining_errors)
+
+    @property
+    def sample(self) -> Matches:
+        """Evenly spread subset of the fitted stars, or all of them if they are few."""
+        return self.reader.sample(self.placed, self._remaining_errors)
+
+    @cached_property
+    def dates(self) -> Float:
+        """Distinct dates of the stars in decimal years; empty if they have no dates."""
+        return dates_of(self.placed if self.placed.in_memory else self.sample)
+
+    @cached_property
+    def last_epoch(self) -> float:
+        """Latest date of the stars in decimal years; they must have dates if the model drifts."""
+        if self.placed.in_memory:
+            return float(np.max(self.placed.column("epoch")))
+        return float(np.max(self.shards.groups.epoch))
+
+    @property
+    def error_scale_sentence(self) -> str:
+        """Sentence about quoted errors that are far too small; empty if they are adequate."""
+        if self.errors.factor == 1.0:
+            return ""
+        return error_scale_sentence(
+            self.errors.factor,
+            self.shards.survey.reference_sigma,
+            self.model.unit,
+            by_magnitude=self.placed.has_mag,
         )
-    return open_run(
-        run_configuration(
-            Path(config), Path(folder), resume=resume, force=overwrite, seed=seed, report=report
+
+    # -- posterior and assessment -----------------------------------------------------------------
+
+    @property
+    def is_sampled(self) -> bool:
+        """True if there is a posterior."""
+        return "posterior" in self.made or (self.directory / "posterior.nc").exists()
+
+    @cached_property
+    def stored_diagnostics(self) -> Diagnostics | None:
+        """Diagnostics that were made or stored; None if there are none."""
+        return self._artefact(
+            "diagnostics",
+            "diagnose",
+            lambda: load_diagnostics(self.directory, self.fit, self.posterior),
         )
-    )
 
-
-def _pairs(positions: Positions, name: str) -> list[tuple[float, float]]:
-    """Positions (x, y) as a list of pairs; a single position becomes a list with one pair."""
-    try:
-        pairs = np.atleast_2d(np.asarray(_without_unit(positions, name), float))
-    except (TypeError, ValueError):
-        pairs = np.zeros((0, 0))
-    if pairs.ndim != 2 or pairs.shape[1] != 2:
-        raise InputError(
-            f"{name} is {positions!r}", where="budget", do="give (x, y), or a list of such pairs"
+    @property
+    def stored_evaluation(self) -> Evaluation | None:
+        """Evaluation that was made or stored; None if there is none of this posterior."""
+        if "evaluation" not in self.made and not self.directory.done("evaluate"):
+            return None
+        return self._artefact(
+            "evaluation",
+            "evaluate",
+            lambda: load_evaluation(self.directory, self.fit, self.posterior),
         )
-    return [(float(x), float(y)) for x, y in pairs]
 
+    @cached_property
+    def error_model(self) -> ErrorModel:
+        """Error model of positions, with all errors."""
+        model: ErrorModel = load_object(hooks.ERROR_MODEL)(self)
+        return model
 
-def _without_unit(positions: Any, name: str) -> Any:
-    """Positions as plain numbers; those with a unit other than the pixel are refused."""
-    several = isinstance(positions, list | tuple)
-    if several and not any(hasattr(value, "to_value") for value in positions):
-        return [_without_unit(value, name) for value in positions]
-    if several or hasattr(positions, "to_value"):
-        return values_in(positions, "pix", name, where="budget")
-    return positions
+    @cached_property
+    def drawn_errors(self) -> DrawnErrors:
+        """Draws of all position errors, including those of products."""
+        drawn: DrawnErrors = load_object(hooks.DRAWN_ERRORS)(self)
+        return drawn
+
+    @cached_property
+    def evaluation_settings(self) -> EvaluationSettings:
+        """Settings of the evaluation."""
+        settings: EvaluationSettings = load_object(hooks.SETTINGS)(self)
+        return settings
+
+    @property
+    def epoch(self) -> float | None:
+        """Epoch of the assessment in decimal years; None if the model does not depend on time.
+
+        By default it is the date from which a product is to be used, or the latest date of the
+        stars if that is later, because errors of a drift grow with time.
+        """
+        if self.config.assess.epoch is not None or self.model.time is None:
+            return self.config.assess.epoch  # without reading the stars
+        return max((self.last_epoch, *self.config.products.useafter_years()))
+
+    @property
+    def source_name(self) -> str:
+        """Name of the run in its products; empty if it has no folder."""
+        return "" if self.directory.in_memory else str(self.directory.path)
+
+    @property
+    def time_dependence(self) -> Mapping[str, Any]:
+        """Section 'time_dependence' of summary.json; empty if there is none."""
+        section: Mapping[str, Any] = self.directory.summary.get("time_dependence", {})
+        return section
+
+    @property
+    def checks(self) -> tuple[Check, ...]:
+        """All checks except those of an evaluation."""
+        checks: tuple[Check, ...] = load_object(hooks.CHECKS)(self)
+        return checks

@@ -6,7 +6,7 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
-from bayesdist.app.results import Results
+from bayesdist.app.run import Run
 from bayesdist.app.screen import log_file
 from bayesdist.app.stages import make_stages
 from bayesdist.app.store.lock import LOCK
@@ -17,18 +17,17 @@ from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data.formats.files import write_matches
 
 MATCHES_FILE = "matches.h5"  # stars of a run that was made in memory
-# artefacts of a run in memory that are saved, each by a stage; products are made from them
-ARTEFACTS = ("fitted", "posterior", "stored", "evaluation")
+# stages of a run in memory that are saved; products are made from them
 STAGES = ("fit", "sample", "diagnose", "evaluate", "export")
 
 
-def save_run(results: Results, folder: Path) -> None:
-    """Write a run in memory to a folder, together with its stars; it appears whole or not at all.
+def save_run(run: Run, folder: Path) -> None:
+    """Write a run to a folder, together with its stars; it appears whole or not at all.
 
     Parameters
     ----------
-    results : Results
-        Artefacts of a run in memory.
+    run : Run
+        Run in memory, or in another folder, which is copied.
     folder : pathlib.Path
         New or empty folder.
 
@@ -38,20 +37,22 @@ def save_run(results: Results, folder: Path) -> None:
         If the folder is not empty or cannot be made, or files that the run was made from have
         changed.
     """
-    unsaved, config = results.run, results.config
+    if not run.directory.in_memory:
+        copy_run(run.directory, folder)
+        return
+    unsaved, config = run.directory, run.config
     has_matches = not unsaved.facts["inputs"]  # else the stars are in files
     with atomic_directory(folder) as temporary:
         if has_matches:
-            write_matches(temporary / MATCHES_FILE, results.inputs.load())
-        base = temporary if has_matches else results.base
+            write_matches(temporary / MATCHES_FILE, run.inputs.load())
+        base = temporary if has_matches else run.base
         directory = RunDirectory.plan(temporary, config, unsaved.text, base)
         if not has_matches:
             refuse_other_inputs(unsaved.facts["inputs"], directory.facts["inputs"], base)
-        saved = replace(results, run=directory, made={"inputs": results.inputs})
+        saved = replace(run, directory=directory, made={"inputs": run.inputs})
         directory.begin()
         with log_file(directory / "bayesdist.log"):
-            ready = {name: getattr(results, name) for name in ARTEFACTS}
-            make_stages(saved, STAGES, ready=ready, source=str(folder))
+            make_stages(saved, STAGES, ready=run, source=str(folder))
         directory.note(**places_of(folder if has_matches else base, folder))
 
 

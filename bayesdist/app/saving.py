@@ -9,16 +9,16 @@ from typing import Any
 
 import numpy as np
 
+from bayesdist.app.artefacts.stored_fit import write_stored_fit
 from bayesdist.app.assessment.diagnosing import holdout_summary, holdout_table
 from bayesdist.app.assessment.error_terms import idle_dates
 from bayesdist.app.assessment.periods import periods_summary, periods_table
-from bayesdist.app.kinds.fitted import Fitted
 from bayesdist.app.kinds.matches.added_errors import (
     added_errors_rows,
     in_circle,
 )
 from bayesdist.app.rehearsal import rehearse_solution
-from bayesdist.app.results import Results
+from bayesdist.app.run import Run
 from bayesdist.app.store.keys import attributes
 from bayesdist.app.store.output import write_table
 from bayesdist.app.store.rundir import part_files
@@ -35,25 +35,30 @@ from bayesdist.utils.checks import warnings_of
 
 log = logging.getLogger("bayesdist")
 
+MATCHING = "matching.ecsv"
+FIT_ARTEFACTS = ("fit", "errors", "priors", "added_errors", "parts", "fit_facts")
 
-def save_matches(results: Results) -> None:
+
+def save_matches(run: Run) -> None:
     """Write the matches found in star lists."""
-    matched = results.matched
-    matched.save(results.run.path)
-    results.run.summarise(**{matched.section: matched.facts})
+    folder = run.directory.path
+    if run.match_table is not None:
+        write_table(run.match_table, folder / MATCHING)
+    for part in run.match_parts.values():
+        part.save(folder)
+    run.directory.summarise(**{run.kind.section: run.match_facts})
 
 
-def save_fit(results: Results) -> None:
+def save_fit(run: Run) -> None:
     """Write the least-squares solution and log anything suspicious before sampling starts."""
-    config, data = results.config, results.data
-    fitted = data.fitted
-    fitted.save(results.run.path)
-    results.run.summarise(**fit_sections(fitted, data.placed, skew=config.fit.skew))
-    log_fit(data.fit, results.kind.rows)
-    _log_geometry(data.fit)
-    if results.kind.rehearses_fit:
-        rehearse_solution(results)
-    for level, text in results.kind.fit_notes(data, config):
+    artefacts = {name: getattr(run, name) for name in FIT_ARTEFACTS}
+    write_stored_fit(run.directory.path, **artefacts)
+    run.directory.summarise(**fit_sections(run))
+    log_fit(run.fit, run.kind.rows)
+    _log_geometry(run.fit)
+    if run.kind.rehearses_fit:
+        rehearse_solution(run)
+    for level, text in run.kind.fit_notes(run):
         log.log(level, "fit: %s%s", "WARNING: " if level >= logging.WARNING else "", text)
 
 
@@ -65,17 +70,17 @@ def _log_geometry(fit: LinearFit) -> None:
             log.warning("fit: WARNING: %s", text)
 
 
-def save_sampled(results: Results) -> None:
+def save_sampled(run: Run) -> None:
     """Write the posterior, and its residuals and outlier probabilities of each star."""
-    run, data, posterior = results.run, results.data, results.posterior
-    facts, gauge = run.facts, results.fitted.gauge_words
+    directory, matches, posterior = run.directory, run.matches, run.posterior
+    facts, gauge = directory.facts, run.gauge_words
     provenance = {k: facts[k] for k in ("inputs", "seed", "versions", "created")}
     provenance |= {"gauge": gauge} if gauge else {}
-    table = data.stars if data.stars.in_memory else None
-    save_posterior(posterior, table, run / "posterior.nc", provenance=provenance)
-    write_star_files(data.stars, data.fit, posterior, run / FOLDER)
-    circle = in_circle(data.matched.stars, results.config)
-    run.summarise(**sample_sections(posterior, in_circle=circle))
+    table = matches if matches.in_memory else None
+    save_posterior(posterior, table, directory / "posterior.nc", provenance=provenance)
+    write_star_files(matches, run.fit, posterior, directory / FOLDER)
+    circle = in_circle(run.stars, run.config)
+    directory.summarise(**sample_sections(posterior, in_circle=circle))
     c, n = posterior.convergence, posterior.sampler
     if c.converged:
         log.info("sample: converged after %d steps, %d passes", n.steps, n.passes)
@@ -83,67 +88,61 @@ def save_sampled(results: Results) -> None:
         log.warning("sample: NOT CONVERGED after %d steps: %s", n.steps, "; ".join(c.reasons))
 
 
-def save_diagnosed(results: Results) -> None:
+def save_diagnosed(run: Run) -> None:
     """Write the diagnostics, including those of held-out stars, periods and exposures."""
-    run, diagnostics = results.run, results.diagnostics
-    results.kind.save_diagnosed(run, results.data, results.posterior, diagnostics, results.config)
-    write_diagnostics(run, results.fit, results.posterior, diagnostics)
+    directory, diagnostics = run.directory, run.diagnostics
+    run.kind.save_diagnosed(run)
+    write_diagnostics(directory, run.fit, run.posterior, diagnostics)
     if diagnostics.holdout is not None:
-        write_table(holdout_table(diagnostics.holdout), run / "holdout.ecsv")
-        run.summarise(holdout=holdout_summary(diagnostics.holdout))
+        write_table(holdout_table(diagnostics.holdout), directory / "holdout.ecsv")
+        directory.summarise(holdout=holdout_summary(diagnostics.holdout))
         log.info("diagnose: %s", diagnostics.holdout.verdict)
         log.info("diagnose: %s", diagnostics.holdout.coverage_words)
     periods = diagnostics.periods
     if periods is not None:
-        write_table(periods_table(periods), run / "periods.ecsv")
-        run.summarise(periods=periods_summary(periods))
+        write_table(periods_table(periods), directory / "periods.ecsv")
+        directory.summarise(periods=periods_summary(periods))
         for text in (periods.verdict, periods.pattern_sentence, *periods.cautions):
             log.info("diagnose: %s", text)
 
 
-def save_evaluation(results: Results) -> None:
+def save_evaluation(run: Run) -> None:
     """Write maps, budget, margins and validity periods."""
-    run, config, evaluation = results.run, results.config, results.evaluation
+    directory, config, evaluation = run.directory, run.config, run.evaluation
     for text in warnings_of(evaluation.checks):
         log.warning("evaluate: WARNING: %s", text)
     if idle := idle_dates(config, config.requirements()):
         log.warning("evaluate: WARNING: %s", idle)
-    gauge, solution = results.fitted.gauge_words, results.solution
-    write_evaluation(run, results.fit, results.posterior, solution, gauge, evaluation)
-    run.summarise(**results.kind.evaluation_sections(solution, config))
+    gauge, solution = run.gauge_words, run.solution
+    write_evaluation(directory, run.fit, run.posterior, solution, gauge, evaluation)
+    directory.summarise(**run.kind.evaluation_sections(run))
     for period in evaluation.validity:
         log.info("evaluate: %s", period.sentence)
     largest = max(float(np.nanmax(period.per_axis)) for period in evaluation.maps)
-    log.info(
-        "evaluate: largest uncertainty per axis %.4g %s (1 sigma)", largest, results.fit.model.unit
-    )
+    log.info("evaluate: largest uncertainty per axis %.4g %s (1 sigma)", largest, run.model.unit)
 
 
-def save_products(results: Results) -> None:
+def save_products(run: Run) -> None:
     """List the exported files in summary.json and the log."""
-    products = results.made["products"]
-    results.run.summarise(products=products)
+    products = run.made["products"]
+    run.directory.summarise(products=products)
     log.info("export: %s", ", ".join(p["path"] for p in products) or "no products asked for")
 
 
-def save_figures(results: Results) -> None:
+def save_figures(run: Run) -> None:
     """List the figures in summary.json."""
-    results.run.summarise(figures=results.made["figures"])
+    run.directory.summarise(figures=run.made["figures"])
 
 
-def fit_sections(fitted: Fitted, stars: Matches, *, skew: bool = False) -> dict[str, Any]:
-    """Sections 'data' and 'fit' of summary.json, and others known only while the fit is made.
-
-    `stars` are those returned by `Fitted.placed`. `skew` is True if the skew of the axes is
-    requested.
-    """
-    fit, errors = fitted.linear, fitted.errors
+def fit_sections(run: Run) -> dict[str, Any]:
+    """Sections 'data' and 'fit' of summary.json, and others known only while the fit is made."""
+    fit, errors, stars = run.fit, run.errors, run.placed
     optional: dict[str, Any] = {}
     if errors.factor != 1.0:
         optional["error_scale"] = errors.factor
-    if fitted.grouped is not None:
-        optional["added_errors"] = added_errors_rows(fitted.grouped)
-    if skew:
+    if run.added_errors is not None:
+        optional["added_errors"] = added_errors_rows(run.added_errors)
+    if run.config.fit.skew:
         optional["skew"] = _skew(fit)
     return {
         "data": {
@@ -162,7 +161,7 @@ def fit_sections(fitted: Fitted, stars: Matches, *, skew: bool = False) -> dict[
             "geometry": [GeometryRow.row(chip) for chip in geometries(fit)],
             **optional,
         },
-        **fitted.facts,
+        **run.fit_facts,
     }
 
 

@@ -2,26 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 from bayesdist.app.config import load_config
-from bayesdist.app.kinds.fitted import Fitted
-from bayesdist.app.pipeline import (
-    diagnose,
-    error_model,
-    evaluate,
-    export,
-    fit,
-    match,
-    report,
-    sample,
-)
+from bayesdist.app.pipeline import diagnose, evaluate, export, fit, match, report, sample
 from bayesdist.app.rehearsal import rehearse
-from bayesdist.app.results import Results, open_results
+from bayesdist.app.run import Run
 from bayesdist.app.saving import (
+    FIT_ARTEFACTS,
     save_diagnosed,
     save_evaluation,
     save_figures,
@@ -33,15 +23,20 @@ from bayesdist.app.saving import (
 from bayesdist.app.screen import log_file, progress_bar
 from bayesdist.app.store.made_from import NEEDS, STAGES
 from bayesdist.app.store.rundir import RunDirectory
-from bayesdist.assess.evaluation import Evaluation
 from bayesdist.errors import InputError, NotConvergedError
-from bayesdist.infer import Posterior
 from bayesdist.infer.posterior.checks import convergence_check
 from bayesdist.utils.memory import release_memory
 
 __all__ = ["continue_stage", "make_stages", "run"]
 
 ASSESS = ("diagnose", "evaluate")
+# artefacts by the stages that save them, for a run in memory
+ARTEFACTS = {
+    "fit": FIT_ARTEFACTS,
+    "sample": ("posterior",),
+    "diagnose": ("diagnostics",),
+    "evaluate": ("evaluation",),
+}
 
 
 def run(
@@ -97,104 +92,87 @@ def run(
         seed=seed,
         command=command,
     )
-    with initialized(directory) as results:
+    with initialized(directory) as planned:
         names = list(STAGES)
-        names = names[names.index(results.config.begins_with) : None if report else -1]
-        results = make_stages(results, names)
-        _require_converged(results, strict)
+        names = names[names.index(planned.config.begins_with) : None if report else -1]
+        _require_converged(make_stages(planned, names), strict)
     return directory.path
 
 
 def make_stages(
-    results: Results,
+    run: Run,
     stages: Collection[str],
     *,
     force: bool = False,
     pdf: bool = False,
-    ready: Mapping[str, Any] | None = None,
+    ready: Run | None = None,
     source: str = "",
-) -> Results:
+) -> Run:
     """Run stages that are not up to date, and save their results.
 
     Results of other stages are loaded from the folder when they are needed.
 
     Parameters
     ----------
-    results : Results
+    run : Run
     stages : collection of str
         Names of the stages.
     force : bool
         Run the stages even if they are up to date.
     pdf : bool
         Write figures as PDF, too.
-    ready : mapping of str to object, optional
-        Artefacts by name that were computed before and only have to be saved.
+    ready : Run, optional
+        Run whose artefacts up to the evaluation only have to be saved.
     source : str
         Name of the run in its products; by default that of its folder.
 
     Returns
     -------
-    Results
+    Run
     """
-    r, run, config, base = results, results.run, results.config, results.base
-    source, ready = source or str(run.path), ready or {}
+    directory, source = run.directory, source or str(run.directory.path)
 
-    def stage(
-        name: str, artefact: str, make: Callable[[], Any], save: Callable[[Results], None]
-    ) -> None:
-        """Make and save an artefact if its stage is to be run."""
-        nonlocal r
+    def stage(name: str, make: Callable[[Run], Run], save: Callable[[Run], None]) -> None:
+        """Make and save the artefacts of a stage if it is to be run."""
+        nonlocal run
 
-        def made() -> Results:
-            value = ready[artefact] if artefact in ready else make()
-            results_of_stage = r.having(**{artefact: value})
-            save(results_of_stage)
+        def made() -> Run:
+            if ready is not None and name in ARTEFACTS:
+                artefacts = {item: getattr(ready, item) for item in ARTEFACTS[name]}
+                after_stage = run.having(**artefacts)
+            else:
+                after_stage = make(run)
+            save(after_stage)
             # matches are read back, so that their rows refer to the files of the run
-            return results_of_stage if name != "match" else r.having(inputs=r.inputs)
+            return after_stage if name != "match" else run.having(inputs=run.inputs)
 
         if name in stages:
-            r = run.make(name, made, force=force).value or r
+            run = directory.make(name, made, force=force).value or run
             release_memory()
 
-    def fitted() -> Fitted:
-        """Fit of the rehearsal if there is one, otherwise a new one."""
-        return r.made.get("fitted") or fit(r.matched, config, base, r.reader).fitted
-
-    def exported() -> list[dict[str, Any]]:
-        evaluation, posterior = r.stored_evaluation, r.posterior
-        return export(
-            evaluation, posterior, r.stored, r.data, config, base, run.path, source=source
-        )
-
-    stage("match", "matched", lambda: match(r.inputs, config), save_matches)
-    stage("fit", "fitted", fitted, save_fit)
-    stage("sample", "posterior", lambda: _sampled(r), save_sampled)
-    stage("diagnose", "stored", lambda: diagnose(r.posterior, r.data, config, base), save_diagnosed)
-    stage("evaluate", "evaluation", lambda: evaluated(r), save_evaluation)
-    stage("export", "products", exported, save_products)
-    stage("report", "figures", lambda: report(r, pdf=pdf), save_figures)
-    return r
-
-
-def evaluated(results: Results) -> Evaluation:
-    """Maps, budget, margins and validity periods of a run that was sampled and diagnosed."""
-    posterior, diagnostics, data = results.posterior, results.diagnostics, results.data
-    return evaluate(
-        error_model(posterior, diagnostics, data, results.config),
-        posterior,
-        diagnostics,
-        data,
-        results.config,
-        results.base,
-        source=results.source_name,
-        series=results.series,
+    stage("match", match, save_matches)
+    stage("fit", _fitted, save_fit)
+    stage("sample", _sampled, save_sampled)
+    stage("diagnose", diagnose, save_diagnosed)
+    stage("evaluate", evaluate, save_evaluation)
+    stage(
+        "export",
+        lambda r: r.having(products=export(r, directory.path, source=source)),
+        save_products,
     )
+    stage("report", lambda r: r.having(figures=report(r, pdf=pdf)), save_figures)
+    return run
 
 
-def _sampled(r: Results) -> Posterior:
+def _fitted(run: Run) -> Run:
+    """Run with the fit of its rehearsal if there is one, otherwise with a new one."""
+    return run if "fit" in run.made else fit(run)
+
+
+def _sampled(run: Run) -> Run:
     """Sample the posterior with a progress bar."""
     with progress_bar("sample") as progress:
-        return sample(r.data, r.config, folder=r.run.path, progress=progress)
+        return sample(run, folder=run.directory.path, progress=progress)
 
 
 def continue_stage(
@@ -231,34 +209,34 @@ def continue_stage(
     stages = ASSESS if stage == "assess" else (stage,)
     needs = (begins_with,) if stage == "fit" != begins_with else NEEDS[stages[0]]
     directory.require(stage, needs)
-    with initialized(directory) as results:
-        results = make_stages(results, stages, force=True, pdf=pdf)
+    with initialized(directory) as run:
+        run = make_stages(run, stages, force=True, pdf=pdf)
         if stage == "sample":
-            _require_converged(results, strict)
+            _require_converged(run, strict)
     return directory
 
 
 @contextmanager
-def initialized(directory: RunDirectory) -> Iterator[Results]:
-    """Check that a run can be carried out, create its folder, and open its results."""
-    with open_results(directory) as results:
+def initialized(directory: RunDirectory) -> Iterator[Run]:
+    """Check that a run can be carried out, create its folder, and open it."""
+    with Run.of(directory) as run:
         begins = directory.is_planned
         if begins:
-            results = rehearse(results)
+            run = rehearse(run)
         with directory.locked():
             directory.begin()
             if begins:
-                results = results.adopting_inputs()
+                run = run.adopting_inputs()
             with log_file(directory / "bayesdist.log"):
-                yield results
+                yield run
 
 
-def _require_converged(results: Results, strict: bool) -> None:
+def _require_converged(run: Run, strict: bool) -> None:
     """Raise NotConvergedError if `strict` and the sampler has not converged."""
-    posterior = results.posterior
+    posterior = run.posterior
     if strict and convergence_check(posterior.convergence).level == "fail":
         raise NotConvergedError(
             f"the sampler has not converged ({'; '.join(posterior.convergence.reasons)})",
-            where=str(results.run.path),
+            where=str(run.directory.path),
             do="raise sampler.max_steps and resume, or simplify the model",
         )

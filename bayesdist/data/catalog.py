@@ -148,6 +148,16 @@ class ReferenceCatalog:
             arrays["epoch"] = self.epoch[which]
         return replace(self, **arrays, star=self.star[which])
 
+    def by_code(self, *names: str) -> Float | None:
+        """Columns (codes, n) by the code of the star; None if the catalogue lacks any of them."""
+        out = np.zeros((int(self.star.max()) + 1, len(names)))
+        for k, name in enumerate(names):
+            values = getattr(self, name)
+            if values is None:
+                return None
+            out[self.star, k] = values
+        return out
+
     def rescaled(self, factor: float, unit: str) -> ReferenceCatalog:
         """Convert the catalogue to another unit.
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from bayesdist.app.assessment.error_terms import assessment_rng
 from bayesdist.app.config import load_config
-from bayesdist.app.results import Results
+from bayesdist.app.run import Run
 from bayesdist.app.stages import make_stages
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess import LocalErrors
@@ -59,7 +59,7 @@ def configuration(truth: CampaignTruth, seed: int) -> dict[str, Any]:
     } | truth.config
 
 
-def assessed(truth: CampaignTruth, folder: Path, seed: int) -> Results:
+def assessed(truth: CampaignTruth, folder: Path, seed: int) -> Run:
     """Results of a run of this campaign, its assessment made."""
     truth.write(folder)
     (folder / "config.toml").write_text(toml_text(configuration(truth, seed)))
@@ -71,7 +71,7 @@ def assessed(truth: CampaignTruth, folder: Path, seed: int) -> Results:
         return make_stages(results, ("diagnose", "evaluate"))
 
 
-def actual_error(results: Results, truth: CampaignTruth) -> np.ndarray:
+def actual_error(results: Run, truth: CampaignTruth) -> np.ndarray:
     """Predicted less true positions (NEW, chips * ny * nx, 2) in exposures that are yet to come.
 
     Whoever uses the calibration there fits shift and rotation, with stars all over the chips.
@@ -100,7 +100,7 @@ def _aligned(predicted: np.ndarray, true: np.ndarray) -> np.ndarray:
 
 
 def coefficient_errors(
-    results: Results, truth: CampaignTruth
+    results: Run, truth: CampaignTruth
 ) -> tuple[list[str], np.ndarray, np.ndarray]:
     """Names, errors (n,) and covariance (n, n) of the coefficients, in the gauge of the first chip.
 
@@ -137,15 +137,15 @@ def _true_coefficients(model: DistortionModel, truth: CampaignTruth) -> np.ndarr
     return theta
 
 
-def table_errors(results: Results, truth: CampaignTruth) -> np.ndarray:
+def table_errors(results: Run, truth: CampaignTruth) -> np.ndarray:
     """Of the look-up tables over the grid of the assessment (chips, N, 3, 2).
 
     Error, and its sigmas by the nodes alone and with what lies between them.  The best polynomial
     is taken off the error, as polynomials follow the tables.
     """
     out = []
-    local = {term.name: term for term in results.errors.terms if isinstance(term, LocalErrors)}
-    for table in results.fitted.tables.tables:
+    local = {term.name: term for term in results.error_model.terms if isinstance(term, LocalErrors)}
+    for table in results.tables.tables:
         chip = next(one for one in truth.chips if one.number == table.chip)
         fine = mesh(*(np.arange(1.0, n, 3.0) for n in (chip.columns, chip.rows)))
         grid = mesh(*grid_pixels((chip.columns, chip.rows), results.config.assess.grid))
@@ -167,9 +167,9 @@ def table_errors(results: Results, truth: CampaignTruth) -> np.ndarray:
     return np.array(out)
 
 
-def stated_sigma(results: Results) -> np.ndarray:
+def stated_sigma(results: Run) -> np.ndarray:
     """Standard deviations (N, 2) of all terms of the budget together, over the same grid."""
-    errors, settings = results.errors, results.settings
+    errors, settings = results.error_model, results.evaluation_settings
     rng = restarted(assessment_rng(results.config))
     total = errors.at(settings.domain(errors), n=settings.draws, rng=rng).total
     return np.column_stack([total.u, total.v])

@@ -16,8 +16,9 @@ import numpy as np
 from astropy.table import Table
 
 from bayesdist.app.assessment.error_terms import assessment_rng
+from bayesdist.app.assessment.evaluating import margins_of_run
 from bayesdist.app.config import load_config
-from bayesdist.app.results import Results, margins_of
+from bayesdist.app.run import Run
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess import Margin, Requirement
 from bayesdist.assess.domain import field_statistic
@@ -62,7 +63,7 @@ def configuration(truth: Truth, seed: int) -> dict[str, Any]:
     return config
 
 
-def assessed(truth: Truth, folder: Path, seed: int) -> Results:
+def assessed(truth: Truth, folder: Path, seed: int) -> Run:
     """Results of a run of these stars, its assessment made."""
     if truth.self_calibrated:
         lists_of(truth).write(folder / "stars.ecsv")
@@ -78,7 +79,7 @@ def assessed(truth: Truth, folder: Path, seed: int) -> Results:
 
 
 def actual_error(
-    results: Results, truth: Truth, rng: np.random.Generator, *, kindest: bool = False
+    results: Run, truth: Truth, rng: np.random.Generator, *, kindest: bool = False
 ) -> np.ndarray:
     """Predicted less true positions (chips * ny * nx, 2) over the grid of the assessment.
 
@@ -100,7 +101,7 @@ def actual_error(
         piece = next(one for one in truth.chips if one.number == chip.number)
         true.append(truth.true_map(*piece.mosaic(x, y), epoch))
     seen, at = np.concatenate(predicted), np.concatenate(true)
-    if "solved" in results.fitted.parts:
+    if "solved" in results.parts:
         error = selfcal_error(results, truth, seen, code)
     elif framed:
         error = truth.frames[model.exposures[code]].undone(seen) - at
@@ -123,13 +124,13 @@ def without_motion(error: np.ndarray, at: np.ndarray) -> np.ndarray:
     return (both - taken).reshape(2, -1).T
 
 
-def stated_sigma(results: Results, *, kindest: bool = False) -> np.ndarray:
+def stated_sigma(results: Run, *, kindest: bool = False) -> np.ndarray:
     """Standard deviations (ny * nx, 2) of all terms of the budget together, over the same grid.
 
     With `kindest` they are those of an observer who fits shift and rotation, as the actual errors
     of `actual_error` then are.
     """
-    errors, settings = results.errors, results.settings
+    errors, settings = results.error_model, results.evaluation_settings
     if kindest:
         errors = replace(errors, aligned=True)
     rng = restarted(assessment_rng(results.config))
@@ -137,7 +138,7 @@ def stated_sigma(results: Results, *, kindest: bool = False) -> np.ndarray:
     return np.column_stack([total.u, total.v])
 
 
-def carried(truth: Truth | CampaignTruth, folder: Path, seed: int) -> Results:
+def carried(truth: Truth | CampaignTruth, folder: Path, seed: int) -> Run:
     """Results of a run of whatever kind, its assessment made."""
     if isinstance(truth, CampaignTruth):
         return campaign_measure.assessed(truth, folder, seed)
@@ -145,7 +146,7 @@ def carried(truth: Truth | CampaignTruth, folder: Path, seed: int) -> Results:
 
 
 def compared(
-    results: Results,
+    results: Run,
     truth: Truth | CampaignTruth,
     rng: np.random.Generator,
     *,
@@ -158,7 +159,7 @@ def compared(
     """
     if isinstance(truth, CampaignTruth):
         error = campaign_measure.actual_error(results, truth)
-        return error, campaign_measure.stated_sigma(results), len(results.data.stars)
+        return error, campaign_measure.stated_sigma(results), len(results.matches)
     error = actual_error(results, truth, rng, kindest=kindest)[None]
     return error, stated_sigma(results, kindest=kindest), truth.stars["x"].size
 
@@ -177,7 +178,7 @@ def attainable(margin: Margin, factor: float) -> float:
     return float(np.mean(at_or_under >= enough[0])) if enough else 0.0
 
 
-def judged(results: Results, error: np.ndarray) -> list[dict[str, Any]]:
+def judged(results: Run, error: np.ndarray) -> list[dict[str, Any]]:
     """Verdicts on requirements whose limits are a little under and over the actual error's."""
     requirements = tuple(
         Requirement(name, statistic, factor * float(field_statistic(statistic, error)))
@@ -193,7 +194,7 @@ def judged(results: Results, error: np.ndarray) -> list[dict[str, Any]]:
             "verdict": m.verdict,
             "reason": m.reason,
         }
-        for m, (_, _, factor) in zip(margins_of(results, requirements), ASKED, strict=True)
+        for m, (_, _, factor) in zip(margins_of_run(results, requirements), ASKED, strict=True)
     ]
 
 
@@ -215,7 +216,7 @@ def measured(name: str, seed: int, n: int | None = None) -> dict[str, Any]:
         rng = np.random.default_rng([7, seed])
         error, stated, n_stars = compared(results, truth, rng, kindest=one.kindest)
         margins = [margin for one in error[:JUDGED] for margin in judged(results, one)]
-        warnings = list(results.run.summary["warnings"])
+        warnings = list(results.directory.summary["warnings"])
         converged = bool(results.posterior.convergence.converged)
     pull = np.abs(error) / stated
     return {

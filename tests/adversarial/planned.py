@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from bayesdist.app.assessment.evaluating import margins_of_run
 from bayesdist.app.commands.on_runs.plan import content_of, futures_of, schedules_of
-from bayesdist.app.results import Results, margins_of
+from bayesdist.app.run import Run
 from bayesdist.assess import Requirement
 from bayesdist.assess.planning.futures import exposures_needed
 
@@ -95,9 +96,9 @@ def first_exposures(truth: Truth, n: int, **requirement: Any) -> Truth:
     return replace(truth, stars=stars, config=config, frames=frames)
 
 
-def reached(results: Results) -> float:
+def reached(results: Run) -> float:
     """Limit of p95 that is met with the probability asked for, in pixels."""
-    [margin] = margins_of(results, (Requirement("r", "p95", 1.0, probability=ASKED),))
+    [margin] = margins_of_run(results, (Requirement("r", "p95", 1.0, probability=ASKED),))
     return float(np.quantile(margin.draws, ASKED))
 
 

@@ -36,7 +36,7 @@ def outcome(kind: str, seed: int) -> dict[str, Any]:
         return {
             "chi2": float(error @ np.linalg.solve(cov, error)),
             "pull": error / np.sqrt(np.diag(cov)),
-            "tables": table_errors(results, truth) if results.fitted.tables.tables else None,
+            "tables": table_errors(results, truth) if results.tables.tables else None,
             "tests": {one.name: one for one in results.diagnostics.score_tests},
         }
 

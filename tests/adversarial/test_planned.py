@@ -28,7 +28,7 @@ def test_what_few_exposures_leave_open_more_of_them_decide(name, full, tmp_path)
     (tmp_path / "now").mkdir()
     now = first_exposures(truth, few.exposures, limit=few.limit)
     results = assessed(now, tmp_path / "now", 1)
-    [margin] = results.run.summary["margins"]
+    [margin] = results.directory.summary["margins"]
     assert margin["probability_met"] < ASKED
     [(_, [need])] = needs_of(results, content_of(results))
     assert need.exposures is not None and need.exposures <= 2 * MORE

@@ -18,8 +18,9 @@ import numpy as np
 from astropy.table import Table
 
 from bayesdist.app.cli import main
+from bayesdist.app.config import load_config
 from bayesdist.app.rehearsal import rehearse
-from bayesdist.app.results import Results, results_of
+from bayesdist.app.run import Run
 from bayesdist.app.screen import start_logging
 from bayesdist.app.stages import ASSESS, initialized, make_stages
 from bayesdist.app.store.rundir import RunDirectory
@@ -252,8 +253,8 @@ def carried_out(run: Path, *stages: str) -> Path:
     """Stages of a run whose folder holds nothing but a configuration."""
     start_logging(quiet=True)  # as a command does: the log of the run has all of it
     names = [one for name in stages for one in (ASSESS if name == "assess" else (name,))]
-    with initialized(RunDirectory.open(run)) as results:
-        make_stages(results, names)
+    with initialized(RunDirectory.open(run)) as opened:
+        make_stages(opened, names)
     return run
 
 
@@ -261,11 +262,17 @@ def summary_of(run: Path) -> dict[str, Any]:
     return json.loads((run / "summary.json").read_text(encoding="utf-8"))
 
 
-def after_stages(directory: RunDirectory, *stages: str, rehearsed: bool = True) -> Results:
-    """Results of stages of a run that begins here; whoever has them closes them."""
-    results = results_of(directory)
+def after_stages(directory: RunDirectory, *stages: str, rehearsed: bool = True) -> Run:
+    """Run after some stages, which begins here; the caller must close it."""
+    run = Run.of(directory)
     if rehearsed:
-        results = rehearse(results)
+        run = rehearse(run)
     directory.begin()
-    results = results.adopting_inputs()
-    return make_stages(results, stages, force=True)
+    run = run.adopting_inputs()
+    return make_stages(run, stages, force=True)
+
+
+def in_memory(config: Path) -> Run:
+    """Run of a configuration file in memory; the caller must close it."""
+    settings, text = load_config(config)
+    return Run.of(RunDirectory.unsaved(settings, text, files=True, base=config.parent))

@@ -9,8 +9,8 @@ import pytest
 from bayesdist.app.config import load_config
 from bayesdist.app.kinds.matches import sources as app_matches
 from bayesdist.app.kinds.matches.sources import load_matches
-from bayesdist.app.kinds.matches.stars import fit_stars
-from bayesdist.app.results import open_results
+from bayesdist.app.pipeline import fit
+from bayesdist.app.run import Run
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data import Matches, read_matches, write_partitioned
 from bayesdist.data.storage import StoredRows
@@ -148,9 +148,8 @@ def test_sums_over_pieces_are_those_of_the_whole(job, tmp_path, on_disk, monkeyp
     for limit in (1000, 10 * N):
         monkeypatch.setattr(app_matches, "IN_MEMORY", limit)
         run = RunDirectory.plan(tmp_path / "none", config, text, job.parent)
-        with open_results(run) as results:
-            fitted = fit_stars(results.matched, results.config)
-            sums.append(results.having(fitted=fitted).diagnostics.sums)
+        with Run.of(run) as results:
+            sums.append(fit(results).diagnostics.sums)
     one, other = sums
     np.testing.assert_array_equal(one.exposures.n_used, other.exposures.n_used)
     for name in ("uu", "vv"):

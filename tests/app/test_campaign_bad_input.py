@@ -13,7 +13,7 @@ from astropy.table import Table, vstack
 from astropy.time import Time
 
 from bayesdist.app.kinds.campaign.input_validation import frames_not_set, shear_warnings
-from bayesdist.app.results import results_of
+from bayesdist.app.run import Run
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data import Matches
 from bayesdist.errors import DegenerateError
@@ -165,7 +165,7 @@ def test_an_exposure_with_one_chip_serves_for_that_one(campaign, folder, name, m
     assert np.isfinite(fit.mean).all() and np.isfinite(fit.cov).all()
     assert 0.8 < fit.chi2 / fit.dof < 1.3
     assert name in summary_of(run)["exposures_skipped"]  # of those that are fitted alone
-    warnings = results_of(RunDirectory.open(run)).matched.warnings
+    warnings = Run.of(RunDirectory.open(run)).match_facts["warnings"]
     assert any(f"chip {missing}" in text and name in text for text in warnings)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
-from bayesdist.app.results import Results
+from bayesdist.app.run import Run
 from bayesdist.assess.terms.correlated import DEVIATIONS, STRUCTURE, STRUCTURE_IN_FIT
 from bayesdist.diagnose.correlated.information import Information, cell_sums
 from bayesdist.infer.solution.solution import likelihood_of
@@ -27,15 +27,15 @@ SIZE = 0.01  # px: of the pattern, either way along x
 
 
 @dataclass(frozen=True)
-class Run:
+class Patterned:
     truth: CampaignTruth
-    results: Results
+    results: Run
 
 
-def run_of(kind: str, folder: Path) -> Iterator[Run]:
+def run_of(kind: str, folder: Path) -> Iterator[Patterned]:
     truth = KINDS[kind].truth(1)
     with closing(assessed(truth, folder, 1)) as results:
-        yield Run(truth, results)
+        yield Patterned(truth, results)
 
 
 @pytest.fixture(scope="module")
@@ -49,12 +49,12 @@ def plain(tmp_path_factory):
     yield from run_of("campaign_inside", tmp_path_factory.mktemp("plain"))
 
 
-def rows(run: Run) -> dict[str, dict]:
-    return {row["name"]: row for row in summary_of(run.results.run.path)["budget"]}
+def rows(run: Patterned) -> dict[str, dict]:
+    return {row["name"]: row for row in summary_of(run.results.directory.path)["budget"]}
 
 
 def test_a_pattern_is_measured_and_in_the_budget(patterned):
-    found = summary_of(patterned.results.run.path)["discrepancy"]["structure"]
+    found = summary_of(patterned.results.directory.path)["discrepancy"]["structure"]
     by_axis = {row["axis"]: row["rms"] for row in found}
     # the polynomials lie along the pixels but for a small rotation
     assert by_axis["u"] == pytest.approx(SIZE, rel=0.4)
@@ -79,7 +79,7 @@ def test_draws_are_spread_by_what_the_pattern_does_to_the_fit(patterned):
     posterior, n = results.posterior, results.posterior.model.n_distortion
     more = np.sqrt(np.diag(results.solution.cov)[:n] / np.diag(posterior.cov)[:n])
     assert np.median(more) > 1.02 and more.min() > 0.9
-    table = Table.read(results.run / "coefficients.ecsv")
+    table = Table.read(results.directory / "coefficients.ecsv")
     assert np.isfinite(table["sd"]).all()
 
 
@@ -95,13 +95,13 @@ def test_at_the_mode_the_priors_pull_as_hard_as_the_stars(plain):
     """Or the structure would be that of deviations which their priors have shrunk."""
     results = plain.results
     likelihood = likelihood_of(results.posterior)
-    sums = results.data.shards.sum(cell_sums, likelihood, 32)
-    information = Information(results.fit.model, likelihood.theta, sums, results.fitted.priors)
+    sums = results.shards.sum(cell_sums, likelihood, 32)
+    information = Information(results.fit.model, likelihood.theta, sums, results.priors)
     of_stars = Information(
         results.fit.model,
         likelihood.theta,
         sums,
-        type(results.fitted.priors).none(results.fit.model),
+        type(results.priors).none(results.fit.model),
     )
     D = results.fit.model.n_distortion
 

@@ -11,18 +11,22 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
-from bayesdist.app.config import load_config
-from bayesdist.app.kinds.campaign.fit import fit_campaign
-from bayesdist.app.kinds.campaign.inputs import read_campaign
-from bayesdist.app.kinds.campaign.matching import match_lists
-from bayesdist.app.kinds.fit_data import FitData
-from bayesdist.app.pipeline import diagnose
-from bayesdist.app.results import results_of
+from bayesdist.app.kinds.campaign.parts import ExposuresAlone, ExposureScatter
+from bayesdist.app.pipeline import diagnose, fit, match
+from bayesdist.app.run import Run
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data import read_matches
 from bayesdist.files.tables import read_table
 from bayesdist.infer import load_fit
-from tests.app.support import carried_out, cli, good, one_sentence, refused, summary_of
+from tests.app.support import (
+    carried_out,
+    cli,
+    good,
+    in_memory,
+    one_sentence,
+    refused,
+    summary_of,
+)
 from tests.reduced import only_in_full
 
 N, LATER = 14, 3  # exposures, and how many of them the release does not see
@@ -95,8 +99,8 @@ def test_what_is_held_out_is_no_part_of_the_fit(run) -> None:
     pairs = read_matches(run / "pairs", unit="pix")
     assert data["rejected"]["held out"] == found["n"] + found["n_excluded"]
     assert summary["matching"]["n_pairs"] == len(pairs)
-    matched = results_of(RunDirectory.open(run)).matched
-    kept, held = matched.stars, matched.held
+    opened = Run.of(RunDirectory.open(run))
+    kept, held = opened.stars, opened.held_stars
     assert len(kept) + len(held) == len(pairs)
     assert not set(kept.exposure_names) & set(found["exposures"])
     # a star goes or stays with all of its detections
@@ -109,22 +113,21 @@ def test_what_is_held_out_is_no_part_of_the_fit(run) -> None:
 @only_in_full("test_pipeline has a script that does")
 def test_functions_find_what_the_run_has_found(run) -> None:
     """Lists are matched and fitted without a run's folder, and are prepared as those of the run."""
-    config, _ = load_config(run / "config.toml")
-    matched = match_lists(read_campaign(config, run))
-    fitted = fit_campaign(matched)
+    prepared, results = fit(match(in_memory(run / "config.toml"))), Run.of(RunDirectory.open(run))
     known = load_fit(run / "fit.nc")
-    np.testing.assert_array_equal(fitted.linear.mean, known.mean)
-    np.testing.assert_array_equal(fitted.linear.cov, known.cov)
-    results, prepared = results_of(RunDirectory.open(run)), FitData(matched, fitted)
+    np.testing.assert_array_equal(prepared.fit.mean, known.mean)
+    np.testing.assert_array_equal(prepared.fit.cov, known.cov)
     for name in ("x", "u", "sigma_u", "star", "exposure"):
         for made, read in (
-            (prepared.stars, results.data.stars),
-            (prepared.held, results.data.held),
+            (prepared.matches, results.matches),
+            (prepared.held_out, results.held_out),
         ):
             np.testing.assert_array_equal(getattr(made, name), getattr(read, name))
-    assert matched.whole == results.matched.whole and len(matched.whole) == 2
-    np.testing.assert_array_equal(fitted.alone.values, results.fitted.alone.values)
-    np.testing.assert_array_equal(fitted.scatter.tau, results.fitted.scatter.tau)
+    assert prepared.held_exposures == results.held_exposures
+    assert len(prepared.held_exposures) == 2
+    alone, scatter = prepared.part(ExposuresAlone).series, prepared.part(ExposureScatter)
+    np.testing.assert_array_equal(alone.values, results.part(ExposuresAlone).series.values)
+    np.testing.assert_array_equal(scatter.tau, results.part(ExposureScatter).tau)
 
 
 @pytest.mark.slow
@@ -169,8 +172,8 @@ def test_an_exposure_that_went_wrong_is_named(run, folder, tmp_path, monkeypatch
     for one in run.iterdir():
         if one.is_file():
             shutil.copy(one, tmp_path / "other" / one.name)
-    results = results_of(RunDirectory.open(tmp_path / "other"))
-    found = diagnose(results.posterior, results.data, results.config, results.base).holdout
+    results = Run.of(RunDirectory.open(tmp_path / "other"))
+    found = diagnose(results).diagnostics.holdout
     assert found.level == "fail" and f"exposure {name}, held out whole" in found.verdict
 
 

@@ -10,7 +10,7 @@ import pytest
 from bayesdist.app.config.data import MatchesConfig
 from bayesdist.app.config.section import RunDetector
 from bayesdist.app.pipeline import evaluate
-from bayesdist.app.results import open_results
+from bayesdist.app.run import Run
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.tables.result_files import load_diagnostics, load_evaluation
 from bayesdist.errors import InputError
@@ -20,20 +20,13 @@ from .support import summary_of
 
 @pytest.fixture(scope="module")
 def results(finished):
-    with open_results(RunDirectory.open(finished.path)) as opened:
+    with Run.of(RunDirectory.open(finished.path)) as opened:
         yield opened
 
 
 def test_what_is_read_is_what_would_be_made_again(results):
-    kept = load_evaluation(results.run, results.fit, results.posterior)
-    made = evaluate(
-        results.errors,
-        results.posterior,
-        results.diagnostics,
-        results.data,
-        results.config,
-        results.base,
-    )
+    kept = load_evaluation(results.directory, results.fit, results.posterior)
+    made = evaluate(results).evaluation
     assert kept.budget.rows() == made.budget.rows()
     assert kept.checks == made.checks and kept.verdict == made.verdict
     for a, b in zip(kept.margins, made.margins, strict=True):
@@ -44,7 +37,7 @@ def test_what_is_read_is_what_would_be_made_again(results):
 
 
 def test_the_verdict_is_the_worst_of_all(results):
-    kept = load_evaluation(results.run, results.fit, results.posterior)
+    kept = load_evaluation(results.directory, results.fit, results.posterior)
     level, reasons = kept.verdict
     assert level == "fail"
     assert any(text.startswith("Too tight: missed") for text in reasons)
@@ -52,17 +45,17 @@ def test_the_verdict_is_the_worst_of_all(results):
 
 
 def test_diagnostics_are_those_of_the_summary(results):
-    found, summary = results.stored, summary_of(results.run.path)
+    found, summary = results.stored_diagnostics, summary_of(results.directory.path)
     assert [one.name for one in found.score_tests] == [r["name"] for r in summary["score_tests"]]
     assert found.misfit.p_value == summary["misfit"]["p_value"]
-    assert found.sample.n_total == len(results.data.stars)
+    assert found.sample.n_total == len(results.matches)
 
 
 def test_they_belong_to_one_posterior(results):
     other = replace(results.posterior, theta=results.posterior.theta + 1e-6)
-    assert load_diagnostics(results.run, results.fit, other) is None
+    assert load_diagnostics(results.directory, results.fit, other) is None
     with pytest.raises(InputError, match="other data or settings"):
-        load_evaluation(results.run, results.fit, other)
+        load_evaluation(results.directory, results.fit, other)
 
 
 @pytest.mark.parametrize(
@@ -76,10 +69,8 @@ def test_maps_budget_and_requirements_are_of_the_field_of_the_detector(results, 
     """The same errors as over the whole detector, at the positions that see the sky alone."""
     detector = RunDetector(**results.config.detector.model_dump() | {"field": field})
     config = results.config.model_copy(update={"detector": detector})
-    whole = load_evaluation(results.run, results.fit, results.posterior)
-    made = evaluate(
-        results.errors, results.posterior, results.diagnostics, results.data, config, results.base
-    )
+    whole = load_evaluation(results.directory, results.fit, results.posterior)
+    made = evaluate(results.with_config(config)).evaluation
     found, every = made.maps[0], whole.maps[0]
     X, Y = np.meshgrid(every.x, every.y)
     inside = (X > 200) & (X < 800) & (Y > 100) & (Y < 700)

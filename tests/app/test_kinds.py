@@ -7,44 +7,39 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bayesdist.app.config import load_config
-from bayesdist.app.kinds.errors import ErrorLaw
-from bayesdist.app.kinds.fit_data import FitData, StarReader
-from bayesdist.app.kinds.kind import kind_of
-from bayesdist.app.kinds.matches.stars import fit_stars, match_stars, read_stars
-from bayesdist.app.kinds.sampling import sample_stars
-from bayesdist.app.results import open_results
-from bayesdist.app.saving import fit_sections
+from bayesdist.app.artefacts.errors import ErrorLaw
+from bayesdist.app.artefacts.reader import StarReader
+from bayesdist.app.artefacts.stored_fit import read_stored_fit, write_stored_fit
+from bayesdist.app.pipeline import fit, match, sample
+from bayesdist.app.run import Run
+from bayesdist.app.saving import FIT_ARTEFACTS, fit_sections
 from bayesdist.app.store import as_json
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data import MagnitudeErrors
 from bayesdist.infer import load_fit, load_posterior
-from tests.app.support import as_table, simulated, snapshot, summary_of, write_job
+from tests.app.support import as_table, in_memory, simulated, snapshot, summary_of, write_job
 
 
 @pytest.fixture(scope="module")
 def job(finished):
-    config, _ = load_config(finished.config)
-    return config, finished.config.parent
+    with in_memory(finished.config) as run:
+        yield run
 
 
 @pytest.fixture(scope="module")
 def fitted(job):
-    config, base = job
-    matched = match_stars(read_stars(config, base), config)
-    return matched, fit_stars(matched, config)
+    return fit(match(job))
 
 
-def test_functions_find_what_a_run_finds(finished, job, fitted):
+def test_functions_find_what_a_run_finds(finished, fitted):
     before = snapshot(finished.path.parent)
-    (config, _), (matched, found) = job, fitted
-    posterior = sample_stars(FitData(matched, found), config)
+    posterior = sample(fitted).posterior
     assert snapshot(finished.path.parent) == before
     known, draws = load_fit(finished.path / "fit.nc"), load_posterior(finished.path)
-    np.testing.assert_array_equal(found.linear.mean, known.mean)
-    np.testing.assert_array_equal(found.linear.cov, known.cov)
+    np.testing.assert_array_equal(fitted.fit.mean, known.mean)
+    np.testing.assert_array_equal(fitted.fit.cov, known.cov)
     np.testing.assert_array_equal(posterior.theta, draws.theta)
-    sections = as_json(fit_sections(found, matched.stars))
+    sections = as_json(fit_sections(fitted))
     assert {name: summary_of(finished.path)[name] for name in sections} == sections
 
 
@@ -62,33 +57,27 @@ def test_a_fit_that_is_read_gives_the_same_stars(data, tmp_path):
         data={"matches": "stars.parquet", **data},
         holdout={"fraction": 0.3},
     )
-    config, _ = load_config(path)
-    matched = match_stars(read_stars(config, path.parent), config)
-    found = fit_stars(matched, config)
-    found.save(tmp_path)
-    read = kind_of(config).load_fitted(tmp_path, lambda: matched)
+    found = fit(match(in_memory(path)))
+    write_stored_fit(tmp_path, **{name: getattr(found, name) for name in FIT_ARTEFACTS})
+    read = match(in_memory(path)).having(**read_stored_fit(tmp_path))
     assert (found.errors.factor > 20) == (not data)
-    for made, again in (
-        (FitData(matched, found).stars, FitData(matched, read).stars),
-        (FitData(matched, found).held, FitData(matched, read).held),
-    ):
+    for made, again in ((found.matches, read.matches), (found.held_out, read.held_out)):
         assert len(made) == len(again) > 0
         np.testing.assert_array_equal(made.sigma_u, again.sigma_u)
         np.testing.assert_array_equal(made.sigma_v, again.sigma_v)
-    assert len(matched.stars) + len(matched.held) == len(matches)
+    assert len(found.stars) + len(found.held_stars) == len(matches)
 
 
 def test_another_artefact_drops_what_rested_on_the_former(finished, fitted):
-    with open_results(RunDirectory.open(finished.path)) as results:
-        _, found = fitted
-        posterior, sums, data = results.posterior, results.diagnostics.sums, results.data
+    with Run.of(RunDirectory.open(finished.path)) as results:
+        posterior, sums, matches = results.posterior, results.diagnostics.sums, results.matches
         flagged = results.having(posterior=replace(posterior, n_flagged=7))
         assert flagged.posterior.n_flagged == 7 and results.posterior is posterior
-        assert flagged.data is data and flagged.diagnostics.sums is not sums
-        refitted = flagged.having(fitted=found)
-        assert refitted.fit is found.linear and refitted.data is not data
+        assert flagged.matches is matches and flagged.diagnostics.sums is not sums
+        refitted = flagged.having(fit=fitted.fit, priors=fitted.priors)
+        assert refitted.fit is fitted.fit and "matches" not in vars(refitted)
         assert refitted.posterior.n_flagged == posterior.n_flagged  # of the run's folder again
-        assert refitted.matched is results.matched
+        assert refitted.stars is results.stars
 
 
 def test_one_law_of_errors_for_all_stars():
@@ -105,10 +94,9 @@ def test_one_law_of_errors_for_all_stars():
 
 
 def test_stars_are_read_anew_only_where_they_are_others(fitted):
-    matched, found = fitted
-    reader, model = StarReader(), found.linear.model
-    shards = reader.shards(model, matched.stars)
-    assert reader.shards(model, matched.stars) is shards
-    assert reader.sample(matched.stars) is reader.sample(matched.stars)
-    assert reader.shards(model, matched.stars, ErrorLaw(2.0)) is not shards
+    reader, model, stars = StarReader(), fitted.model, fitted.stars
+    shards = reader.shards(model, stars)
+    assert reader.shards(model, stars) is shards
+    assert reader.sample(stars) is reader.sample(stars)
+    assert reader.shards(model, stars, ErrorLaw(2.0)) is not shards
     reader.close()

@@ -43,15 +43,14 @@ class SpotsConfig(StarsConfig):
 KIND = '''
 """Spots of a mask: their places are those of the mask, whose scale has an error."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from bayesdist.app.kinds.errors import QUOTED
-from bayesdist.app.kinds.fitted import Fitted, load_fitted
 from bayesdist.app.kinds.kind import RunKind
-from bayesdist.app.kinds.matched import Matched, set_aside
-from bayesdist.app.kinds.parts import Part
+from bayesdist.app.artefacts.holdout import set_aside
+from bayesdist.app.artefacts.parts import Part
+from bayesdist.app.artefacts.stored_fit import read_stored_fit
 from bayesdist.assess.terms.parameters import ScaleError
 from bayesdist.data import Matches
 from bayesdist.infer import GaussianPriors, build_model, fit_linear
@@ -77,33 +76,43 @@ class SpotsKind(RunKind):
         sigma = np.full(len(x), config.spots.sigma)
         return Matches(x, y, u, v, sigma_u=sigma, sigma_v=sigma, unit="pix")
 
-    def match(self, inputs, config):
-        return Matched(*set_aside(config, inputs), facts={"scale_sigma": config.spots.scale_sigma})
+    def match(self, run):
+        stars, held, exposures = set_aside(run.config, run.inputs)
+        return run.having(
+            stars=stars,
+            held_stars=held,
+            held_exposures=exposures,
+            match_facts={"scale_sigma": run.config.spots.scale_sigma},
+        )
 
-    def fit(self, matched, config, base, reader):
+    def fit(self, run):
+        config = run.config
         model = build_model(
-            matched.stars,
+            run.stars,
             order=config.model.order,
             size=config.detector.size,
             reference_pixel=config.model.reference_pixel,
         )
-        linear = fit_linear(reader.shards(model, matched.stars), model)
-        mask = Mask(matched.facts["scale_sigma"])
-        return Fitted(linear, QUOTED, GaussianPriors.none(model), parts={"mask": mask})
+        return run.having(
+            fit=fit_linear(run.reader.shards(model, run.stars), model),
+            priors=GaussianPriors.none(model),
+            parts={"mask": Mask(run.match_facts["scale_sigma"])},
+        )
 
-    def load_fitted(self, folder, matched):
-        mask = Mask(float((folder / "mask.txt").read_text()))
-        return replace(load_fitted(folder), parts={"mask": mask})
+    def load_fit(self, run):
+        stored = read_stored_fit(run.directory.path)
+        mask = Mask(float((run.directory / "mask.txt").read_text()))
+        return run.having(**stored | {"parts": {"mask": mask}})
 
-    def error_terms(self, solution, data, config):
-        sigma = data.fitted.part(Mask).scale_sigma
+    def error_terms(self, run, solution):
+        sigma = run.part(Mask).scale_sigma
         term = ScaleError("expansion of the mask", "scale", sigma, solution, "given by the user")
-        return [term, *super().error_terms(solution, data, config)]
+        return [term, *super().error_terms(run, solution)]
 
-    def checks(self, data, series):
-        return (Check("Mask", "Scale of the mask", str(data.fitted.part(Mask).scale_sigma)),)
+    def checks(self, run):
+        return (Check("Mask", "Scale of the mask", str(run.part(Mask).scale_sigma)),)
 
-    def report_parts(self, run, data, posterior, diagnostics, epoch):
+    def report_parts(self, run):
         return {"words": Terminology(rows="spots", all_rows="spots", false_rows="false spots")}
 
 

@@ -4,37 +4,22 @@ from __future__ import annotations
 
 import numpy as np
 
-from bayesdist.app.config import load_config
-from bayesdist.app.pipeline import (
-    diagnose,
-    error_model,
-    evaluate,
-    export,
-    fit,
-    match,
-    read,
-    sample,
-)
-from bayesdist.app.results import open_results
+from bayesdist.app.pipeline import diagnose, evaluate, export, fit, match, sample
+from bayesdist.app.run import Run
 from bayesdist.app.store.rundir import RunDirectory
 
-from .support import snapshot, summary_of
+from .support import in_memory, snapshot, summary_of
 
 
 def test_a_script_finds_what_a_run_finds(finished, tmp_path):
     before = snapshot(finished.path.parent)
-    config, _ = load_config(finished.config)
-    base = finished.config.parent
-    data = fit(match(read(config, base), config), config, base)
-    posterior = sample(data, config)
-    found = diagnose(posterior, data, config, base)
-    errors = error_model(posterior, found, data, config)
-    evaluation = evaluate(errors, posterior, found, data, config, base)
-    products = export(evaluation, posterior, found, data, config, base, tmp_path)
-    data.reader.close()
+    with in_memory(finished.config) as run:
+        run = evaluate(diagnose(sample(fit(match(run)))))
+        products = export(run, tmp_path, source=str(finished.path))
+        evaluation = run.evaluation
     assert snapshot(finished.path.parent) == before
-    with open_results(RunDirectory.open(finished.path)) as results:
-        np.testing.assert_array_equal(posterior.theta, results.posterior.theta)
+    with Run.of(RunDirectory.open(finished.path)) as results:
+        np.testing.assert_array_equal(run.posterior.theta, results.posterior.theta)
         known = results.evaluation
     assert evaluation.budget.rows() == known.budget.rows()
     assert evaluation.checks == known.checks

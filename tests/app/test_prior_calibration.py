@@ -302,9 +302,11 @@ frame = "shift"
 
 def test_a_run_goes_by_it(tmp_path):
     """The fit of a configuration, saved and loaded, and the inputs that are recorded."""
+    from bayesdist.app.artefacts.stored_fit import read_stored_fit, write_stored_fit
     from bayesdist.app.config import parse_config
-    from bayesdist.app.kinds.fit_data import StarReader
-    from bayesdist.app.kinds.kind import kind_of
+    from bayesdist.app.pipeline import fit, match
+    from bayesdist.app.run import Run
+    from bayesdist.app.saving import FIT_ARTEFACTS
     from bayesdist.app.store.made_from import hashes_of
 
     rng, model = np.random.default_rng(9), model_of(3)
@@ -314,15 +316,14 @@ def test_a_run_goes_by_it(tmp_path):
     second = stars_of(model, theta, 12, rng)
     as_table(second).write(tmp_path / "second.ecsv")
     config = parse_config(CONFIG, "second.toml")
-    kind = kind_of(config)
     assert "fit.nc" in hashes_of(config, tmp_path)
-    matched = kind.match(kind.read(config, tmp_path), config)
-    found = kind.fit(matched, config, tmp_path, StarReader(config.resources()))
+    run = Run.of(RunDirectory.unsaved(config, CONFIG, files=True, base=tmp_path))
+    found = fit(match(run))
     expected = fitted(second, model, earlier(solution, model, frame="shift").loose())
-    np.testing.assert_allclose(found.linear.mean, expected.mean, atol=1e-9)
-    found.save(tmp_path)
-    again = kind.load_fitted(tmp_path, lambda: matched)
-    np.testing.assert_array_equal(again.priors.joint.precision, found.priors.joint.precision)
+    np.testing.assert_allclose(found.fit.mean, expected.mean, atol=1e-9)
+    write_stored_fit(tmp_path, **{name: getattr(found, name) for name in FIT_ARTEFACTS})
+    again = read_stored_fit(tmp_path)
+    np.testing.assert_array_equal(again["priors"].joint.precision, found.priors.joint.precision)
 
 
 @pytest.mark.parametrize("stage", ["fit", "sample", "diagnose"])

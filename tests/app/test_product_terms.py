@@ -12,7 +12,7 @@ from astropy.wcs import WCS
 
 from bayesdist.app.products.made_files import ProductInput, made_files
 from bayesdist.app.products.product_terms import _Laid, product_terms
-from bayesdist.app.results import open_results
+from bayesdist.app.run import Run
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.calibration.calibration import GaussianSolution, calibration_of
 from bayesdist.calibration.plane import Plane
@@ -72,7 +72,7 @@ def run(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def results(run):
-    with open_results(RunDirectory.open(run)) as found:
+    with Run.of(RunDirectory.open(run)) as found:
         yield found
 
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import bayesdist as bd
+from bayesdist.app.artefacts.errors import QUOTED
+from bayesdist.app.assessment.evaluating import margins_of_run
 from bayesdist.app.config import parse_config
 from bayesdist.app.config.assess import BudgetBlock
-from bayesdist.app.kinds.errors import QUOTED
-from bayesdist.app.results import margins_of
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess import Catalogue, UserTerm, check_requirements, error_budget
 from bayesdist.assess.assessment import MISSING_TERMS
@@ -78,7 +78,7 @@ def test_budgets_are_those_of_a_run(both):
 
 def test_verdicts_are_those_of_a_run(both):
     results, steps = both
-    found, expected = steps.margins(NEEDS), margins_of(results, NEEDS)
+    found, expected = steps.margins(NEEDS), margins_of_run(results, NEEDS)
     assert len({margin.verdict for margin in expected}) > 1
     for one, other in zip(found, expected, strict=True):
         assert_same(one, other)
@@ -127,7 +127,7 @@ def test_terms_quantities_and_magnitudes_are_those_of_a_run(tmp_path):
     posterior = bd.sample(bd.fit_linear(matches, model), matches, **options)
     stages = ("fit", "sample", "diagnose", "evaluate")
     with closing(after_stages(directory, *stages)) as results:
-        assert results.fitted.errors == QUOTED
+        assert results.errors == QUOTED
         options = {
             "diagnostics": diagnose(posterior, matches),
             "catalogue": catalogue,

@@ -7,7 +7,7 @@ import pytest
 
 import bayesdist as bd
 from bayesdist import formats
-from bayesdist.app.results import open_results
+from bayesdist.app.run import Run
 from bayesdist.app.store.rundir import RunDirectory
 
 X, Y = (a.ravel() for a in np.meshgrid(np.linspace(1, 1000, 9), np.linspace(1, 800, 7)))
@@ -16,7 +16,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::bayesdist.errors.BayesdistWarni
 
 
 def test_a_run_has_the_calibration_that_it_exports(finished):
-    with open_results(RunDirectory(finished.path)) as results:
+    with Run.of(RunDirectory(finished.path)) as results:
         exported = results.product.calibration
     for path in (finished.path, finished.path / "posterior.nc"):
         found = bd.read_calibration(path)

@@ -12,7 +12,7 @@ from astropy.io import fits
 from astropy.table import Table
 from astropy.wcs import WCS
 
-from bayesdist.app.results import results_of
+from bayesdist.app.run import Run
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess import area_map, uncertainty_map
 from bayesdist.assess.terms.correlated import (
@@ -283,8 +283,8 @@ def test_validate_keeps_the_chip_and_the_report_takes_it_up(run, tmp_path):
 
 def test_structure_is_looked_for_on_each_chip(run):
     """By arrays of the true stars, chip by chip; the smaller probability counts twice."""
-    results = results_of(RunDirectory.open(run))
-    fit, table, found = results.fit, results.data.stars, results.diagnostics
+    results = Run.of(RunDirectory.open(run))
+    fit, table, found = results.fit, results.matches, results.diagnostics
     residual, used = residuals(results.posterior, table), found.sample.probably_true
     p = {}
     for chip in CHIPS:

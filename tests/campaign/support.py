@@ -7,16 +7,15 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 from unittest import mock
 
 import numpy as np
 
 from bayesdist.app.config import load_config
 from bayesdist.app.kinds.campaign import fit as stage
-from bayesdist.app.kinds.campaign.matched import CampaignMatched
-from bayesdist.app.kinds.fit_data import FitData
-from bayesdist.app.results import Results, open_results
+from bayesdist.app.kinds.campaign.matched import affine_model_of
+from bayesdist.app.run import Run
 from bayesdist.app.stages import make_stages
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.infer.catalogue.star_errors import StarErrors, star_covariance
@@ -26,7 +25,7 @@ from bayesdist.infer.series import Series
 from bayesdist.infer.solution.solution import TransformedSolution
 from bayesdist.missions.hst.simulate import AcsCampaign, acs_model, read_acs
 from bayesdist.missions.hst.simulate.pointings import OWN
-from bayesdist.model import LookupTable
+from bayesdist.model import DistortionModel, LookupTable
 from tests.app.support import good
 from tests.infer.small_campaign import with_star_errors
 
@@ -105,7 +104,7 @@ class Calibrated:
     ----------
     campaign : AcsCampaign
         What it was made from.
-    results : Results
+    results : Run
     tables : TableFit or None
     bare, joint : HierarchicalFit and TransformedSolution
         All exposures jointly; without and with the correlated errors of the catalogue.
@@ -114,16 +113,16 @@ class Calibrated:
     """
 
     campaign: AcsCampaign
-    results: Results
+    results: Run
     tables: TableFit | None
     bare: HierarchicalFit
     joint: TransformedSolution
     terms: Series
 
     @property
-    def matched(self) -> CampaignMatched:
-        """Pairs as they were matched."""
-        return cast(CampaignMatched, self.results.matched)
+    def affine_model(self) -> DistortionModel:
+        """Configured polynomial with a free linear part for each exposure."""
+        return affine_model_of(self.results.inputs.config, self.results.stars)
 
 
 @contextmanager
@@ -139,7 +138,7 @@ def calibrated(setting: Setting, seed: int) -> Iterator[Calibrated]:
         settings, text = load_config(config)
         run = RunDirectory.plan(Path(folder) / "run", settings, text, base)
         run.begin()
-        with open_results(run) as results:
+        with Run.of(run) as results:
             results = make_stages(results, ("match",))
             with _results_of("fit_tables", "fit_hierarchical") as made:
                 results = make_stages(results, ("fit",))
@@ -149,8 +148,8 @@ def calibrated(setting: Setting, seed: int) -> Iterator[Calibrated]:
                 results=results,
                 tables=made["fit_tables"][1],
                 bare=bare,
-                joint=_with_catalogue(bare, results.data),
-                terms=results.fitted.parts["alone"].series,
+                joint=_with_catalogue(bare, results),
+                terms=results.parts["alone"].series,
             )
 
 
@@ -209,9 +208,9 @@ def _results_of(*names: str) -> Iterator[dict[str, Any]]:
         yield made
 
 
-def _with_catalogue(bare: HierarchicalFit, data: FitData) -> TransformedSolution:
+def _with_catalogue(bare: HierarchicalFit, run: Run) -> TransformedSolution:
     """The joint fit with the errors that a star of the catalogue has in all exposures."""
-    catalog, matches = data.matched.catalogue, data.stars
+    catalog, matches = run.catalogue, run.matches
 
     def by_code(values: Any) -> np.ndarray:
         out = np.zeros(int(catalog.star.max()) + 1)

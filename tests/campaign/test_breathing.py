@@ -65,7 +65,7 @@ def pulls_of(seed: int, folder: Path) -> tuple[dict, np.ndarray]:
             sigma = found.std(axis=0)
             free = sigma > 1e-9
             out.append(((found.mean(axis=0) - project @ true) / np.where(free, sigma, 1.0))[free])
-    return summary_of(results.run.path), np.concatenate(out)
+    return summary_of(results.directory.path), np.concatenate(out)
 
 
 def _frame(x, y, w):

@@ -10,7 +10,7 @@ from astropy.table import Table
 from scipy.interpolate import RegularGridInterpolator
 
 from bayesdist.app.config import load_config
-from bayesdist.app.results import Results, results_of
+from bayesdist.app.run import Run
 from bayesdist.app.stages import make_stages
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.model import Chip, DistortionModel, TimeDependence
@@ -166,7 +166,7 @@ def campaign(kind: Kind, seed: int) -> Campaign:
     return Campaign(model, theta, pattern, Table(columns), rng)
 
 
-def assessed(kind: Kind, seed: int, stars: Table, folder: Path) -> Results:
+def assessed(kind: Kind, seed: int, stars: Table, folder: Path) -> Run:
     """As `bayesdist run` has it when budget and margins are made."""
     stars.write(folder / "stars.parquet")
     text = CONFIG.format(
@@ -180,6 +180,6 @@ def assessed(kind: Kind, seed: int, stars: Table, folder: Path) -> Results:
     (folder / "config.toml").write_text(text)
     config, text = load_config(folder / "config.toml")
     directory = RunDirectory.plan(folder / "run", config, text, folder)
-    results = results_of(directory)
+    results = Run.of(directory)
     directory.begin()
     return make_stages(results, ("fit", "sample", "diagnose"))

@@ -8,7 +8,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from bayesdist.app.results import margins_of
+from bayesdist.app.assessment.evaluating import margins_of_run
 from bayesdist.assess import Margin, Requirement
 from bayesdist.assess.budget_surface import JOINT as MODEL
 from bayesdist.assess.domain import field_statistic
@@ -34,7 +34,7 @@ def _judged(name: str, seed: int, limits: dict[str, float]) -> tuple[list[Margin
     with TemporaryDirectory() as folder, one_thread():
         truth = campaign(kind, seed)
         with closing(assessed(kind, seed, truth.stars, Path(folder))) as results:
-            margins = margins_of(results, requirements)
+            margins = margins_of_run(results, requirements)
             solution, grid = results.solution, results.config.assess.grid
     model, rng = solution.model, truth.rng
     x, y = mesh(*grid_pixels(model.chips[0].size, grid))

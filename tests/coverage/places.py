@@ -10,7 +10,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from scipy.stats import norm
 
-from bayesdist.app.results import errors_of
+from bayesdist.app.assessment.evaluating import drawn_errors_of_run
 from bayesdist.assess.budget import TOTAL, place_budget
 from bayesdist.assess.budget_surface import JOINT as MODEL
 from bayesdist.assess.domain import EvaluationDomain
@@ -89,7 +89,7 @@ def covered(name: str, seed: int) -> dict[str, dict[str, np.ndarray]]:
     with TemporaryDirectory() as folder, one_thread():
         truth = campaign(kind, seed)
         with closing(assessed(kind, seed, truth.stars, Path(folder))) as results:
-            solution, errors = results.solution, errors_of(results)
+            solution, errors = results.solution, drawn_errors_of_run(results)
             discrepancy = results.diagnostics.correlated
         rng = truth.rng
         x, y = rng.uniform(0.5, SIDE + 0.5, (2, PLACES))

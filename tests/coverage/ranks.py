@@ -20,7 +20,8 @@ from typing import Any
 import numpy as np
 from scipy.stats import t as student_t
 
-from bayesdist.app.results import Results, errors_of, margins_of
+from bayesdist.app.assessment.evaluating import drawn_errors_of_run, margins_of_run
+from bayesdist.app.run import Run
 from bayesdist.assess import Requirement
 from bayesdist.assess.domain import EvaluationDomain, field_statistic
 from bayesdist.diagnose.correlated import Discrepancy, DiscrepancyPriors
@@ -277,14 +278,14 @@ def rank(draws: np.ndarray, true: Any) -> float:
     return float(np.mean(draws < true))
 
 
-def _of_coefficients(results: Results, drawn: Drawn, seed: int) -> dict[str, float]:
+def _of_coefficients(results: Run, drawn: Drawn, seed: int) -> dict[str, float]:
     """Ranks of the coefficients and, of one exposure, of the mixture and the likelihood."""
     model = results.solution.model
     basis, points = model.basis(), fields.even_pixels(24)
     at = np.stack(points, axis=1) - fields.MIDDLE + drawn.polynomial(*points)
     true = np.linalg.lstsq(basis.evaluate(*points), at, rcond=None)[0].T
-    kept, own = results.diagnostics.correlated, results.errors.solution.solution
-    n, rng = results.settings.draws, np.random.default_rng([32, seed])
+    kept, own = results.diagnostics.correlated, results.error_model.solution.solution
+    n, rng = results.evaluation_settings.draws, np.random.default_rng([32, seed])
     flat, rows = own.drawn_rows(n, rng)
     which = np.arange(n) % kept.n_draws
     theta = flat[rows] + kept.structure_theta[which]
@@ -312,10 +313,10 @@ def _of_coefficients(results: Results, drawn: Drawn, seed: int) -> dict[str, flo
     return out | {"log-likelihood": rank(said, actual)}
 
 
-def _of_positions(results: Results, drawn: Drawn) -> dict[str, float]:
+def _of_positions(results: Run, drawn: Drawn) -> dict[str, float]:
     """Ranks of errors of positions, and of their statistics over the field."""
     model, mean = results.solution.model, np.asarray(results.solution.mean)
-    errors = errors_of(results)
+    errors = drawn_errors_of_run(results)
     n, true_map = errors.n_draws, drawn.truth.true_map
     x, y = mesh(*grid_pixels(model.chips[0].size, GRID))
     error = true_map(x, y, None) - model.predict(mean, x, y)
@@ -326,7 +327,7 @@ def _of_positions(results: Results, drawn: Drawn) -> dict[str, float]:
         for axis, name in enumerate("uv"):
             out[f"{name} at {i}, {j}"] = rank(said[:, k, axis], error[k, axis])
     asked = tuple(Requirement(s, s, 1.0) for s in STATISTICS)
-    for margin in margins_of(results, asked):
+    for margin in margins_of_run(results, asked):
         name = margin.requirement.statistic
         out[name] = rank(margin.draws, field_statistic(name, error))
     return out

@@ -7,9 +7,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from bayesdist.app.artefacts.errors import ErrorLaw
+from bayesdist.app.artefacts.parts import StoredLookupTables
 from bayesdist.app.kinds.campaign.report import _residuals
-from bayesdist.app.kinds.errors import ErrorLaw
-from bayesdist.app.kinds.parts import StoredLookupTables
 from bayesdist.data import Matches
 from bayesdist.diagnose.overlap import _at_first_epoch, align, chosen_exposures
 from bayesdist.infer.nodes.residuals import inside_chips
@@ -56,19 +56,18 @@ def test_residuals_show_the_pattern_of_the_detector_whatever_the_roll(margin):
     moved = pairs.with_columns(x=x, y=y)
     kept = inside_chips(moved, model)
     assert kept.all() == (margin > 0)
-    data = SimpleNamespace(
-        stars=moved.select(kept),
-        fitted=SimpleNamespace(
-            tables=StoredLookupTables((table,)),
-            errors=ErrorLaw(),
-            inside=lambda stars: kept,
-        ),
-        matched=SimpleNamespace(stars=pairs),
-    )
     config = SimpleNamespace(
         fit=SimpleNamespace(clip_abs=2.0), model=SimpleNamespace(order=2), chips=lambda: (chip,)
     )
-    (found,) = _residuals(data, config)
+    run = SimpleNamespace(
+        inputs=SimpleNamespace(config=config),
+        stars=pairs,
+        matches=moved.select(kept),
+        tables=StoredLookupTables((table,)),
+        errors=ErrorLaw(),
+        model=model,
+    )
+    (found,) = _residuals(run)
     pairs = pairs.select(kept)
     without, after = found.binned_without, found.binned_with
     shift = table.evaluate(pairs.x, pairs.y)

@@ -1,40 +1,32 @@
-"""Checks of a run other than those of residuals: kind of run, sampling, fit, catalogue."""
+"""Checks of a run other than those of an evaluation: kind of run, sampling, fit, residuals."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
-from bayesdist.app.config import Config
-from bayesdist.app.kinds.fit_data import FitData
-from bayesdist.app.kinds.kind import kind_of
+from bayesdist.app.run import Run
 from bayesdist.assess.requirements.verdict import assumption_checks
-from bayesdist.diagnose.diagnostics import Diagnostics
-from bayesdist.infer import Posterior
-from bayesdist.utils.checks import Check
+from bayesdist.utils.checks import Check, in_order
 
 
-def run_checks(
-    data: FitData,
-    posterior: Posterior | None,
-    found: Diagnostics,
-    config: Config,
-    series: Mapping[str, Any] | None,
-) -> tuple[Check, ...]:
-    """Checks of a run that has been sampled, or of a fit alone, in addition to its diagnostics.
+def checks_of_run(run: Run) -> tuple[Check, ...]:
+    """Checks of a run that has been sampled, or of a fit alone, including its diagnostics."""
+    return in_order((*checks_besides_diagnostics(run), *run.diagnostics.checks))
 
-    `series` is the section 'time_dependence' of summary.json; None if the run has none.
-    """
+
+def checks_besides_diagnostics(run: Run) -> tuple[Check, ...]:
+    """Checks of a run that has been sampled, or of a fit alone, in addition to its diagnostics."""
     catalogue = motions = None
-    if data.matched.has_catalogue:
-        catalogue = data.matched.states_errors or config.states_catalogue
-        motions = data.matched.states_motion_errors or config.states_motions
+    if run.kind.has_catalogue:
+        stars = run.catalogue
+        states_errors = stars is not None and stars.sigma_u is not None
+        states_motion_errors = stars is not None and stars.sigma_pm_u is not None
+        catalogue = states_errors or run.config.states_catalogue
+        motions = states_motion_errors or run.config.states_motions
     return (
-        *kind_of(config).checks(data, series or {}),
+        *run.kind.checks(run),
         *assumption_checks(
-            posterior,
-            found,
-            data.model.time,
+            run.posterior if run.is_sampled else None,
+            run.diagnostics,
+            run.model.time,
             catalogue_stated=catalogue,
             motions_stated=motions,
         ),

@@ -4,85 +4,92 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.app.assessment.error_terms import assessment_rng, errors_of_run, evaluation_settings
+from bayesdist.app.assessment.error_terms import assessment_rng
 from bayesdist.app.assessment.periods import period_settings
-from bayesdist.app.config import Config
-from bayesdist.app.kinds.fit_data import FitData
-from bayesdist.app.kinds.kind import kind_of
 from bayesdist.app.kinds.matches.added_errors import in_circle
+from bayesdist.app.run import Run
 from bayesdist.app.store.summary import CoverageRow, Holdout, HoldoutTest
 from bayesdist.assess.domain import WHOLE, in_region
+from bayesdist.data import Matches, ReferenceCatalog
 from bayesdist.diagnose.diagnostics import Diagnostics, diagnose_fit, diagnose_posterior
 from bayesdist.diagnose.holdout.validation import HoldoutValidation, holdout_validation
 from bayesdist.infer import Posterior
 
 
-def diagnose_run(posterior: Posterior, data: FitData, config: Config, base: Path) -> Diagnostics:
-    """Diagnostics of a posterior and of the held-out stars."""
-    fitted, kind = data.fitted, kind_of(config)
-    questions = kind.questions(data, config)
+def diagnostics_of_run(run: Run) -> Diagnostics:
+    """Diagnostics of a run: of its posterior and of the held-out stars, or of the fit alone."""
+    if not run.is_sampled:
+        return _from_residuals(run, None)
+    config, kind = run.config, run.kind
+    questions = kind.questions(run)
     diagnostics = diagnose_posterior(
-        diagnose_residuals(posterior, data, config),
-        data.fit,
-        posterior,
-        data.stars,
-        data.shards,
+        _from_residuals(run, run.posterior),
+        run.fit,
+        run.posterior,
+        run.matches,
+        run.shards,
         rng=assessment_rng(config),
-        tested=data.matched.with_motions(data.sample),
+        tested=_with_motions(run.sample, run.catalogue),
         discrepancy=config.discrepancy.priors(),
-        priors=fitted.priors,
-        match_radius=config.match_radius(data.matched.stars.match_radius),
+        priors=run.priors,
+        match_radius=config.match_radius(run.stars.match_radius),
         structure=questions.structure,
         exposures=questions.exposures,
         settling=questions.settling,
-        catalogue=data.matched.star_errors,
+        catalogue=kind.star_errors(run),
         eliminated=questions.eliminated,
-        periods=period_settings(data, config),
+        periods=period_settings(run),
     )
-    diagnostics = replace(
-        diagnostics, overlap=data.matched.overlap(posterior, fitted.tables.tables)
-    )
-    if data.held is None:
+    diagnostics = replace(diagnostics, overlap=kind.overlap(run))
+    if run.held_out is None:
         return diagnostics
-    errors = errors_of_run(posterior, diagnostics, data, config)
-    settings = evaluation_settings(data, config)
-    predictive = kind.predictive(posterior, diagnostics, errors, data, settings)
-    held = holdout_validation(predictive, data.held, whole=data.matched.whole)
+    predictive = kind.predictive(run.having(diagnostics=diagnostics))
+    held = holdout_validation(predictive, run.held_out, whole=run.held_exposures)
     return replace(diagnostics, holdout=held)
 
 
-def diagnose_residuals(posterior: Posterior | None, data: FitData, config: Config) -> Diagnostics:
+def _from_residuals(run: Run, posterior: Posterior | None) -> Diagnostics:
     """Diagnostics from residuals, of a posterior or of a fit alone."""
-    fitted, kind = data.fitted, kind_of(config)
-    questions = kind.questions(data, config)
+    config, kind = run.config, run.kind
+    questions = kind.questions(run)
     diagnostics = diagnose_fit(
-        data.fit,
+        run.fit,
         posterior,
-        data.stars,
-        data.shards,
-        data.sample,
+        run.matches,
+        run.shards,
+        run.sample,
         eliminated=questions.eliminated,
         centroid=questions.centroid,
-        known=fitted.priors.joint is not None,
-        match_radius=config.match_radius(data.matched.stars.match_radius),
-        in_circle=in_circle(data.matched.stars, config),
+        known=run.priors.joint is not None,
+        match_radius=config.match_radius(run.stars.match_radius),
+        in_circle=in_circle(run.stars, config),
         matched_before=config.begins_with == "fit",
-        error_scale=data.error_scale_sentence,
+        error_scale=run.error_scale_sentence,
         rows=kind.rows,
         chooser=kind.chooser,
     )
     if config.field == WHOLE:
         return diagnostics
-    inside = partial(in_region, config.field, data.model.chips[0].size)
+    inside = partial(in_region, config.field, run.model.chips[0].size)
     return replace(
         diagnostics, coverage=tuple(coverage.within(inside) for coverage in diagnostics.coverage)
     )
+
+
+def _with_motions(stars: Matches, catalogue: ReferenceCatalog | None) -> Matches:
+    """Stars with their proper motions and errors of these, if the catalogue has them."""
+    if catalogue is None or stars.star is None:
+        return stars
+    names = ("pm_u", "pm_v", "sigma_pm_u", "sigma_pm_v")
+    motions = catalogue.by_code(*names)
+    if motions is None:
+        return stars
+    return stars.with_columns(**dict(zip(names, motions[stars.star].T, strict=True)))
 
 
 def holdout_table(found: HoldoutValidation) -> Table:

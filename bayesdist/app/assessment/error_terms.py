@@ -8,16 +8,10 @@ from dataclasses import replace
 import numpy as np
 
 from bayesdist.app.config import Config
-from bayesdist.app.kinds.fit_data import FitData, assessment_epoch
-from bayesdist.app.kinds.kind import kind_of
-from bayesdist.app.kinds.parts import StoredLookupTables
+from bayesdist.app.run import Run
 from bayesdist.assess import Requirement, pixel_scale_of
 from bayesdist.assess.evaluation import EvaluationSettings
 from bayesdist.assess.model import ErrorModel, diagnosed_error_model, error_model
-from bayesdist.diagnose.diagnostics import Diagnostics
-from bayesdist.infer import Posterior
-from bayesdist.infer.solution.solution import Solution
-from bayesdist.model import LookupTable
 from bayesdist.utils import streams
 
 
@@ -26,23 +20,23 @@ def assessment_rng(config: Config) -> np.random.Generator:
     return streams.assessment_rng(config.sampler.seed)
 
 
-def evaluation_settings(data: FitData, config: Config) -> EvaluationSettings:
+def evaluation_settings(run: Run) -> EvaluationSettings:
     """Settings of the evaluation of errors, including the dates of the stars."""
-    return replace(rehearsal_settings(data, config), dates=data.dates)
+    return replace(rehearsal_settings(run), dates=run.dates)
 
 
-def rehearsal_settings(data: FitData, config: Config) -> EvaluationSettings:
+def rehearsal_settings(run: Run) -> EvaluationSettings:
     """Settings of an evaluation without the dates of the stars, which only verdicts mention."""
-    measured = kind_of(config).measures_centroids
+    config, measured = run.config, run.kind.measures_centroids
     return EvaluationSettings(
         grid=config.assess.grid,
-        epoch=assessment_epoch(data, config),
+        epoch=run.epoch,
         draws=config.assess.draws,
         years_ahead=config.assess.years_ahead,
         scale_mas=config.detector.scale_mas,
         single=config.assess.exposure == "single",
         # centroid errors estimated by the fit include no other errors
-        contained=() if measured else config.held_in_residuals(data.model.unit),
+        contained=() if measured else config.held_in_residuals(run.model.unit),
         given=tuple(block.name for block in config.budget if block.stated),
         field=config.field,
     )
@@ -68,46 +62,26 @@ def idle_dates(config: Config, requirements: Sequence[Requirement], where: str =
     )
 
 
-def errors_of_fit(solution: Solution, data: FitData, config: Config) -> ErrorModel:
-    """Error model of a solution alone, without terms derived from residuals."""
-    terms = kind_of(config).error_terms(solution, data, config)
-    scale = pixel_scale_of(solution, scale_mas=config.detector.scale_mas)
-    return error_model(solution, terms, pixel_scale=scale)
+def error_model_of_fit(run: Run) -> ErrorModel:
+    """Error model of the fit alone, without terms derived from residuals."""
+    fit = run.fit
+    terms = run.kind.error_terms(run, fit)
+    scale = pixel_scale_of(fit, scale_mas=run.config.detector.scale_mas)
+    return error_model(fit, terms, pixel_scale=scale)
 
 
-def errors_of_run(
-    posterior: Posterior, found: Diagnostics, data: FitData, config: Config
-) -> ErrorModel:
+def error_model_of_run(run: Run) -> ErrorModel:
     """Error model of a posterior, including terms derived from residuals."""
-    kind = kind_of(config)
-    domain = kind.domain(data, config)
+    posterior, domain = run.posterior, run.kind.domain(run)
     return diagnosed_error_model(
         posterior,
-        found,
-        kind.error_terms(posterior, data, config),
-        hierarchy=data.fitted.hierarchy,
-        catalogue=data.matched.catalogue_name,
+        run.diagnostics,
+        run.kind.error_terms(run, posterior),
+        hierarchy=run.hierarchy,
+        catalogue=run.catalogue_name,
         aligned=domain.aligned,
         single=domain.single,
         frames=domain.frames,
         structure_left=domain.structure_left,
-        pixel_scale=pixel_scale_of(posterior, scale_mas=config.detector.scale_mas),
+        pixel_scale=pixel_scale_of(posterior, scale_mas=run.config.detector.scale_mas),
     )
-
-
-def published_tables(stored: StoredLookupTables, *, held: bool) -> tuple[LookupTable, ...]:
-    """Look-up tables with the errors that apply to their user.
-
-    These are the errors at the nodes and the distortion between them, added in quadrature.  The
-    same distortion affects the values at the nodes, which are averages over their surroundings.  It
-    is added to the tables fitted in this run; `held` is True if the detector's tables are from
-    another run.
-    """
-    out = []
-    for table in stored.tables:
-        between = stored.between.get(table.chip)
-        if table.sigma is not None and between is not None and bool(table.filter) == held:
-            total = np.sqrt(table.sigma**2 + between.left.mean[:, None, None])
-            table = replace(table, sigma=total)
-        out.append(table)
-    return tuple(out)

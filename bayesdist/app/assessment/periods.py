@@ -9,7 +9,7 @@ from astropy.table import Table, vstack
 from astropy.time import Time
 
 from bayesdist.app.config import Config
-from bayesdist.app.kinds.fit_data import FitData
+from bayesdist.app.run import Run
 from bayesdist.app.store.keys import attributes
 from bayesdist.assess import convert, pixel_scale_of
 from bayesdist.data import Matches
@@ -54,12 +54,12 @@ def check_pairs(raw: Matches, config: Config) -> dict[str, int]:
     return out
 
 
-def period_settings(data: FitData, config: Config) -> PeriodSettings | None:
+def period_settings(run: Run) -> PeriodSettings | None:
     """Settings of the comparison of periods; None if none are configured."""
+    config, fit = run.config, run.fit
     if config.periods is None:
         return None
-    fit = data.fit
-    fewest = min(check_pairs(data.placed, config).values())
+    fewest = min(check_pairs(run.placed, config).values())
     scale = pixel_scale_of(fit, scale_mas=config.detector.scale_mas)
     angle = fit.unit != "pix" or scale is not None
     limits = [

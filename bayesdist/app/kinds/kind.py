@@ -3,34 +3,40 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, Generic, Literal, TypeVar
 
-from bayesdist.app.config import Config
-from bayesdist.app.kinds.fit_data import FitData, StarReader
-from bayesdist.app.kinds.fitted import Fitted, load_fitted
-from bayesdist.app.kinds.matched import Matched, Outline
+from bayesdist.app.artefacts.stored_fit import read_stored_fit
 from bayesdist.app.kinds.sampling import sample_stars
-from bayesdist.app.store.rundir import RunDirectory
-from bayesdist.assess.evaluation import EvaluationSettings
-from bayesdist.assess.model import ErrorModel, with_diagnosed_errors
+from bayesdist.app.run import Run
+from bayesdist.assess.model import with_diagnosed_errors
 from bayesdist.assess.terms.forms import ErrorTerm
-from bayesdist.data import MagnitudeErrors
-from bayesdist.diagnose.diagnostics import Diagnostics
+from bayesdist.data import MagnitudeErrors, ReferenceCatalog
 from bayesdist.diagnose.holdout.predictive import Predictive, predictive_of
+from bayesdist.diagnose.overlap import OverlapTest
 from bayesdist.infer import Posterior
+from bayesdist.infer.catalogue.star_errors import StarErrors
 from bayesdist.infer.exposures.hierarchy import Settling
 from bayesdist.infer.selfcal import SelfCalibrationMode
 from bayesdist.infer.solution.solution import Solution
-from bayesdist.plugin import load_object
+from bayesdist.model import DistortionModel, LookupTable
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.checks import Check
 
 C = TypeVar("C", contravariant=False)  # configuration
 I = TypeVar("I")  # inputs
-M = TypeVar("M", bound=Matched)  # fitted and held-out stars
+
+
+@dataclass(frozen=True)
+class Outline:
+    """Properties of a solution that are known before stars are matched."""
+
+    model: DistortionModel  # without the frames of exposures
+    pixel: float  # size of a pixel in the unit of u and v
+    filter: str = ""
+    tables: tuple[LookupTable, ...] = ()  # with the nodes that the fitted tables will have
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,11 +61,12 @@ class EvaluationDomain:
     structure_left: bool = True  # False if errors of look-up tables include the structure
 
 
-class RunKind(ABC, Generic[C, I, M]):
+class RunKind(ABC, Generic[C, I]):
     """One kind of run.
 
     Methods up to `sample` make a posterior; the others contribute what only this kind has to steps
-    that are the same for all kinds.  A kind names itself in `kind` of its configuration.
+    that are the same for all kinds.  They take the run with the artefacts of all earlier stages.  A
+    kind names itself in `kind` of its configuration.
     """
 
     rows: ClassVar[str] = "stars"  # word for the rows of the data
@@ -72,6 +79,9 @@ class RunKind(ABC, Generic[C, I, M]):
     no_order: ClassVar[str] = ""
     # True if errors, requirements and products are tried out with the fit before it is sampled
     rehearses_fit: ClassVar[bool] = False
+    section: ClassVar[str] = ""  # section of summary.json on the matching
+    has_catalogue: ClassVar[bool] = True  # star positions come from a reference catalogue
+    along_detector: ClassVar[bool] = False  # u and v are along the detector axes, not along the sky
 
     # -- up to the posterior ----------------------------------------------------------------------
 
@@ -80,37 +90,34 @@ class RunKind(ABC, Generic[C, I, M]):
         """Inputs of a run; paths are relative to the folder `base`."""
 
     @abstractmethod
-    def match(self, inputs: I, config: C) -> M:
-        """Fitted and held-out stars."""
+    def match(self, run: Run) -> Run:
+        """Run with its stars: artefacts `stars`, `held_stars` and others of the stage 'match'."""
 
     @abstractmethod
-    def fit(self, matched: M, config: C, base: Path, reader: StarReader) -> Fitted:
-        """Least-squares solution; `reader` may hold the stars."""
+    def fit(self, run: Run) -> Run:
+        """Run with its least-squares fit: artefacts `fit`, `errors`, `priors`, `parts`, others."""
 
     def sample(
         self,
-        data: FitData,
-        config: Config,
+        run: Run,
         *,
         folder: Path | None = None,
         progress: Callable[[int, int], None] | None = None,
     ) -> Posterior:
         """Posterior of a fit; checkpoints are written to `folder`."""
-        return sample_stars(data, config, folder=folder, progress=progress)
+        return sample_stars(run, folder=folder, progress=progress)
 
-    def load_matched(
-        self,
-        folder: Path,
-        inputs: I,
-        config: C,
-        summary: Mapping[str, Any],
-    ) -> M:
-        """Matches of an earlier stage, from the folder of a run and its summary.json."""
-        return self.match(inputs, config)
+    def load_matched(self, run: Run) -> Run:
+        """Run with the stars of an earlier stage, from its folder and its summary.json."""
+        return self.match(run)
 
-    def load_fitted(self, folder: Path, matched: Callable[[], M]) -> Fitted:
-        """Fit of an earlier stage; `matched` returns the matches, and is called if they matter."""
-        return load_fitted(folder)
+    def load_fit(self, run: Run) -> Run:
+        """Run with the fit of an earlier stage, from its folder."""
+        return run.having(**read_stored_fit(run.directory.path))
+
+    def with_config(self, inputs: I, config: C) -> I:
+        """Inputs for another configuration, which differs in the model only."""
+        return inputs
 
     def refuse(self, inputs: I) -> None:
         """Raise InputError if inputs are inconsistent."""
@@ -126,84 +133,74 @@ class RunKind(ABC, Generic[C, I, M]):
         """
         return None
 
-    def fit_notes(self, data: FitData, config: C) -> Iterator[tuple[int, str]]:
+    def fit_notes(self, run: Run) -> Iterator[tuple[int, str]]:
         """Level of logging and sentence of each remark on a fit, before it is sampled."""
         yield from ()
 
     # -- from the posterior on --------------------------------------------------------------------
 
-    def questions(self, data: FitData, config: C) -> Questions:
+    def questions(self, run: Run) -> Questions:
         """What the general diagnostics have to know of a fit."""
         return Questions()
 
-    def save_diagnosed(
-        self,
-        run: RunDirectory,
-        data: FitData,
-        posterior: Posterior,
-        diagnostics: Diagnostics,
-        config: C,
-    ) -> None:
+    def overlap(self, run: Run) -> OverlapTest | None:
+        """Comparison of two exposures far apart in time; None if it does not apply."""
+        return None
+
+    def save_diagnosed(self, run: Run) -> None:
         """Write diagnostics that only this kind has, with their sections of summary.json."""
 
-    def predictive(
-        self,
-        posterior: Posterior,
-        diagnostics: Diagnostics,
-        errors: ErrorModel,
-        data: FitData,
-        settings: EvaluationSettings,
-    ) -> Predictive:
+    def predictive(self, run: Run) -> Predictive:
         """Predictive distribution of the assessed solution for the held-out stars.
 
         Quoted errors and jitter include the distortion that the model leaves out at a position.
         That error is common to neighbouring stars.
         """
-        prediction = predictive_of(with_diagnosed_errors(posterior, diagnostics))
-        correlated = diagnostics.correlated
+        prediction = predictive_of(with_diagnosed_errors(run.posterior, run.diagnostics))
+        correlated = run.diagnostics.correlated
         rows = None if correlated is None else correlated.facts.get("structure")
         if not rows:
             return prediction
         side = max(row["length_pix"] for row in rows)
-        local = errors.local_tables(settings.grid, settings.epoch)
+        settings = run.evaluation_settings
+        local = run.error_model.local_tables(settings.grid, settings.epoch)
         return replace(prediction, local=local, cell=(side, side), local_in_noise=True)
 
-    def error_terms(self, solution: Solution, data: FitData, config: Config) -> list[ErrorTerm]:
+    def error_terms(self, run: Run, solution: Solution) -> list[ErrorTerm]:
         """Errors of positions beside those of the solution: those that the user states."""
+        config = run.config
         return [*config.linear_terms(solution), *config.user_terms(solution.model.unit)]
 
-    def domain(self, data: FitData, config: Config) -> EvaluationDomain:
+    def domain(self, run: Run) -> EvaluationDomain:
         """The exposure that errors are evaluated for."""
-        return EvaluationDomain(single=config.assess.exposure == "single")
+        return EvaluationDomain(single=run.config.assess.exposure == "single")
 
-    def null_space(self, data: FitData) -> Float | None:
+    def null_space(self, run: Run) -> Float | None:
         """Directions of the parameters (D, k) that only the gauge fixes; None if there are none."""
         return None
 
-    def checks(self, data: FitData, series: Mapping[str, Any]) -> tuple[Check, ...]:
-        """Checks of matching, exposures and gauge.
-
-        `series` is the section 'time_dependence' of summary.json.
-        """
+    def checks(self, run: Run) -> tuple[Check, ...]:
+        """Checks of matching, exposures and gauge."""
         return ()
 
-    def evaluation_sections(self, solution: Solution, config: C) -> dict[str, Any]:
+    def evaluation_sections(self, run: Run) -> dict[str, Any]:
         """Sections of summary.json about the evaluated solution."""
         return {}
 
-    def report_parts(
-        self,
-        run: RunDirectory,
-        data: FitData,
-        posterior: Posterior,
-        diagnostics: Diagnostics,
-        epoch: float | None,
-    ) -> dict[str, Any]:
+    def report_parts(self, run: Run) -> dict[str, Any]:
         """Fields of the content of the report that only this kind has, by their names."""
         return {}
 
+    # -- stars ------------------------------------------------------------------------------------
 
-def kind_of(config: Config) -> RunKind[Any, Any, Any]:
-    """Kind of run that a configuration describes; it is imported when it is first used."""
-    kind: RunKind[Any, Any, Any] = load_object(config.kind)
-    return kind
+    def catalogue(self, run: Run) -> ReferenceCatalog | None:
+        """Reference catalogue of the stars; None if only the matches are known."""
+        return None
+
+    def star_errors(self, run: Run) -> StarErrors | None:
+        """Errors of the catalogue by star code; None if there are none."""
+        return None
+
+    def filter(self, run: Run) -> str:
+        """Filter of the exposures; empty if it has no name."""
+        return ""

@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bayesdist.app.config import Config
-from bayesdist.app.kinds.fit_data import FitData
+from bayesdist.app.run import Run
 from bayesdist.data import Matches
 from bayesdist.infer import Posterior, sample
 from bayesdist.model import DistortionModel
@@ -21,20 +20,20 @@ STARS_PER_TERM = 3  # fewest stars per term and axis for which residuals show th
 
 
 def sample_stars(
-    data: FitData,
-    config: Config,
+    run: Run,
     *,
     folder: Path | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Posterior:
     """Sample the posterior of a fit; checkpoints are written to `folder`."""
-    for text in doubts_on_numbers(data.sample, data.model):
+    config = run.config
+    for text in doubts_on_numbers(run.sample, run.model):
         log.warning("sample: %s", text)
     return sample(
-        data.fit,
-        data.shards,
-        outliers=config.mixture(data.matched.stars.match_radius),
-        priors=data.fitted.priors,
+        run.fit,
+        run.shards,
+        outliers=config.mixture(run.stars.match_radius),
+        priors=run.priors,
         folder=folder,
         progress=progress,
         **config.sampler.model_dump(),

@@ -10,25 +10,22 @@ from typing import Any
 
 import numpy as np
 
-from bayesdist.app.assessment.error_terms import published_tables
-from bayesdist.app.config import Config
-from bayesdist.app.kinds.fit_data import FitData
+from bayesdist.app.artefacts.parts import StoredLookupTables
 from bayesdist.app.products.made_files import (
     ProductInput,
     further_errors,
     made_files,
-    product_of,
+    product_of_run,
 )
 from bayesdist.app.products.release_set import release_set
+from bayesdist.app.run import Run
 from bayesdist.assess.budget import with_product
-from bayesdist.assess.evaluation import Evaluation
 from bayesdist.assess.terms.forms import PRODUCT
 from bayesdist.calibration.plane import ARCSEC
 from bayesdist.data.sky import sky_of_plane
-from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.diagnose.residuals.stars import StarSample, star_sample
 from bayesdist.files.atomic import atomic_path, path_within
-from bayesdist.infer import Posterior
+from bayesdist.model import LookupTable
 from bayesdist.products.common.celestial import sky_of_header
 from bayesdist.products.registry import format_of, lint
 from bayesdist.utils.limits import FILE_ERROR, SKY_CLOSURE
@@ -36,57 +33,42 @@ from bayesdist.utils.limits import FILE_ERROR, SKY_CLOSURE
 log = logging.getLogger("bayesdist")
 
 
-def export(
-    evaluation: Evaluation | None,
-    posterior: Posterior,
-    found: Diagnostics | None,
-    data: FitData,
-    config: Config,
-    base: Path,
-    folder: Path,
-    *,
-    source: str = "",
-) -> list[dict[str, Any]]:
+def export(run: Run, folder: Path, *, source: str = "") -> list[dict[str, Any]]:
     """Write the configured products and list their properties.
 
     File errors are compared with the budget of the evaluation, and headers on the sky with the
-    stars.
+    stars.  Diagnostics add their errors to those of the parameters.  A run may have neither.
 
     Parameters
     ----------
-    evaluation : Evaluation or None
-    posterior : Posterior
-    found : Diagnostics or None
-        Diagnostics, which add their errors to those of the parameters.
-    data : FitData
-    config : Config
-    base : Path
-        Folder that file names in the configuration are relative to.
+    run : Run
+        Run that was sampled.
     folder : Path
         Folder to write to.
     source : str
-        Name of the solution in the files.
+        Name of the solution in the files; by default that of the run.
 
     Returns
     -------
     list of dict
         One entry per file: path, kind, findings, and other properties.
     """
-    product = product_of(posterior, found, data, config, source)
+    config, evaluation, found = run.config, run.stored_evaluation, run.stored_diagnostics
+    product = product_of_run(run, source=source)
     budget = [] if evaluation is None else evaluation.budget.rows()
     stars = None
     if product.calibration.plane.point is not None and config.products.asked():
         if found is not None:
             stars = found.sample
         else:
-            stars = star_sample(data.sample, len(data.stars), data.fit, posterior)
+            stars = star_sample(run.sample, len(run.matches), run.fit, run.posterior)
     products: list[dict[str, Any]] = []
     release = config.products.release
     if release is not None:
         held = config.tables.detector is not None
-        tables = published_tables(data.fitted.tables, held=held)
-        number, solutions = config.chips()[0].number, {data.matched.filter: product.solution}
-        products += release_set().write(release, number, base, folder, solutions, tables, ())
+        tables = published_tables(run.tables, held=held)
+        number, solutions = config.chips()[0].number, {run.filter: product.solution}
+        products += release_set().write(release, number, run.base, folder, solutions, tables, ())
     facts = None if found is None or found.correlated is None else found.correlated.facts
     calibration = replace(product.calibration, further=further_errors(budget, facts))
     product = replace(product, calibration=calibration)
@@ -116,6 +98,24 @@ def export(
     for entry_of_file in products:
         _compare(entry_of_file, budget)
     return products
+
+
+def published_tables(stored: StoredLookupTables, *, held: bool) -> tuple[LookupTable, ...]:
+    """Look-up tables with the errors that apply to their user.
+
+    These are the errors at the nodes and the distortion between them, added in quadrature.  The
+    same distortion affects the values at the nodes, which are averages over their surroundings.  It
+    is added to the tables fitted in this run; `held` is True if the detector's tables are from
+    another run.
+    """
+    out = []
+    for table in stored.tables:
+        between = stored.between.get(table.chip)
+        if table.sigma is not None and between is not None and bool(table.filter) == held:
+            total = np.sqrt(table.sigma**2 + between.left.mean[:, None, None])
+            table = replace(table, sigma=total)
+        out.append(table)
+    return tuple(out)
 
 
 def _left_out(key: str, product: ProductInput) -> tuple[str, ...]:

@@ -11,13 +11,10 @@ from typing import Any
 import numpy as np
 
 from bayesdist.app.config import Config
-from bayesdist.app.kinds.fit_data import FitData, assessment_epoch
-from bayesdist.app.kinds.fitted import Fitted
-from bayesdist.app.kinds.kind import kind_of
-from bayesdist.app.kinds.matched import Outline
+from bayesdist.app.kinds.kind import Outline
 from bayesdist.app.products.release_set import release_set
+from bayesdist.app.run import Run
 from bayesdist.assess.budget import TOTAL
-from bayesdist.assess.model import with_diagnosed_errors
 from bayesdist.assess.terms.correlated import DEVIATIONS, STRUCTURE, STRUCTURE_IN_FIT
 from bayesdist.assess.terms.forms import PRODUCT
 from bayesdist.assess.terms.parameters import (
@@ -31,8 +28,6 @@ from bayesdist.assess.terms.parameters import (
 from bayesdist.calibration.calibration import Calibration, GaussianSolution, calibration_of
 from bayesdist.calibration.chip_map import FurtherError
 from bayesdist.calibration.plane import ARCSEC, Plane
-from bayesdist.diagnose.diagnostics import Diagnostics
-from bayesdist.infer import Posterior
 from bayesdist.infer.selfcal.prior import fitted_polynomials, undistorted
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.model import LookupTable
@@ -104,10 +99,20 @@ def with_facts_of_run(
     return replace(calibration, pixel_mas=mas, before=tables, further=further)
 
 
-def product_input(solution: Solution, data: FitData, config: Config, source: str) -> ProductInput:
-    """Ingredients of the products of a solution; `source` is its name in the files."""
-    fitted, model = data.fitted, data.model
-    plane, point = Plane(), data.matched.tangent_point
+def product_of_run(run: Run, solution: Solution | None = None, source: str = "") -> ProductInput:
+    """Ingredients of the products of a run.
+
+    Parameters
+    ----------
+    run : Run
+    solution : Solution, optional
+        By default the posterior with all errors of the parameters that were found.
+    source : str
+        Name of the solution in the files; by default that of the run.
+    """
+    model, config = run.model, run.config
+    solution = run.solution if solution is None else solution
+    plane, point = Plane(), run.tangent_point
     if point is not None:
         note = ""
         if model.frames != "none" and len(model.exposures) > 1:
@@ -115,10 +120,10 @@ def product_input(solution: Solution, data: FitData, config: Config, source: str
             first = model.exposures[0]
             note = f"On the sky it is exposure {first}: others have frames of their own."
         plane = Plane("sky", point=point, note=note)
-    epoch, tables = assessment_epoch(data, config), fitted.tables.tables
-    ingredients = _input_of(solution, config, source, plane, data.matched.filter, epoch, tables)
-    notes = (fitted.gauge_words,) if fitted.gauge_words else ()
-    aligned = kind_of(config).domain(data, config).aligned
+    source, tables = source or run.source_name, run.tables.tables
+    ingredients = _input_of(solution, config, source, plane, run.filter, run.epoch, tables)
+    notes = (run.gauge_words,) if run.gauge_words else ()
+    aligned = run.kind.domain(run).aligned
     calibration = replace(ingredients.calibration, notes=notes)
     return replace(ingredients, calibration=calibration, aligned=aligned)
 
@@ -171,21 +176,6 @@ def rehearse_outline(outline: Outline, config: Config, base: Path, source: str) 
         with TemporaryDirectory() as nowhere:
             write = release_set().write
             write(release, number, base, Path(nowhere), {filter: solution}, tables, ())
-
-
-def solution_of(posterior: Posterior, found: Diagnostics | None, fitted: Fitted) -> Posterior:
-    """Posterior with all errors of the parameters that were found, as exported and shown.
-
-    Neither the catalogue nor the matches are needed.
-    """
-    return with_diagnosed_errors(posterior, found, fitted.hierarchy)
-
-
-def product_of(
-    posterior: Posterior, found: Diagnostics | None, data: FitData, config: Config, source: str
-) -> ProductInput:
-    """Ingredients of the products of a posterior with all errors of the parameters."""
-    return product_input(solution_of(posterior, found, data.fitted), data, config, source)
 
 
 def made_files(product: ProductInput, config: Config) -> dict[str, tuple[Built, ...]]:

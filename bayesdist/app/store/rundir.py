@@ -125,8 +125,10 @@ class RunDirectory(ArtefactStore):
         return run
 
     @classmethod
-    def unsaved(cls, config: Config, text: str, *, files: bool) -> RunDirectory:
-        """Run in memory that has no folder yet; files are relative to the current folder.
+    def unsaved(
+        cls, config: Config, text: str, *, files: bool, base: Path | None = None
+    ) -> RunDirectory:
+        """Run in memory that has no folder yet.
 
         Parameters
         ----------
@@ -135,8 +137,10 @@ class RunDirectory(ArtefactStore):
             The configuration as TOML.
         files : bool
             True if the stars are read from files, whose hashes are recorded.
+        base : Path, optional
+            Folder that files are relative to; the current folder by default.
         """
-        run, base = cls(UNSAVED), Path.cwd()
+        run, base = cls(UNSAVED), Path.cwd() if base is None else base
         run._plan(config, text, base, hashes_of(config, base) if files else {}, "")
         return run
 

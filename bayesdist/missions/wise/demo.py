@@ -10,7 +10,7 @@ import numpy as np
 from astropy.table import QTable
 
 from bayesdist.app.commands.on_files.convert import convert
-from bayesdist.app.results import results_of
+from bayesdist.app.run import Run
 from bayesdist.app.screen import number, table_text
 from bayesdist.app.stages import run
 from bayesdist.app.store.output import write_table
@@ -142,8 +142,8 @@ def demo(folder: str | Path, *, format: str | None, force: bool, command: str) -
     write_simulation(folder / "input", matches, truth, "W2", sip='axes = "linear"')
     run(folder / "input" / "config.toml", folder / "run", force=force, command=command)
     finished = RunDirectory.open(folder / "run")
-    results = results_of(finished)
-    against = _against_truth(results.posterior, results.fit, truth)
+    with Run.of(finished) as finished_run:
+        against = _against_truth(finished_run.posterior, finished_run.fit, truth)
     text = f"{against}\n\n{results_text(finished)}"
     if format is None:
         return text

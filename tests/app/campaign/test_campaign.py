@@ -10,7 +10,7 @@ from astropy.io import fits
 from astropy.table import Table
 
 import bayesdist as bd
-from bayesdist.app.kinds.parts import read_tables
+from bayesdist.app.artefacts.parts import read_tables
 from bayesdist.data import read_exposures, read_matches
 from bayesdist.formats.idctab.table import read_idctab
 from bayesdist.formats.lookup.d2im import read_d2im

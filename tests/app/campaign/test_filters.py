@@ -13,13 +13,12 @@ import pytest
 from astropy.table import Table
 
 import bayesdist.app.commands.on_runs.release
-import bayesdist.app.results
 import bayesdist.missions.hst.release
+from bayesdist.app.artefacts.parts import StoredLookupTables, read_tables, write_tables
 from bayesdist.app.commands.on_runs.filters import compare_filters
 from bayesdist.app.commands.on_runs.release import _require_alike
 from bayesdist.app.kinds.campaign.reference import held_tables
-from bayesdist.app.kinds.parts import StoredLookupTables, read_tables, write_tables
-from bayesdist.app.results import results_of
+from bayesdist.app.run import Run
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess import LocalErrors
 from bayesdist.assess.domain import EvaluationDomain
@@ -70,7 +69,7 @@ def runs(folder, run):
 
 @pytest.fixture(scope="module")
 def by_filter(runs):
-    return {name: results_of(RunDirectory.open(run)) for name, run in runs.items()}
+    return {name: Run.of(RunDirectory.open(run)) for name, run in runs.items()}
 
 
 @pytest.fixture(scope="module")
@@ -92,22 +91,22 @@ def release(runs, folder, full):
 
 
 def local_errors(results):
-    return [term for term in results.errors.terms if isinstance(term, LocalErrors)]
+    return [term for term in results.error_model.terms if isinstance(term, LocalErrors)]
 
 
 def test_the_detectors_tables_are_held_and_the_filters_are_fitted(by_filter):
     reference, other = (by_filter[name] for name in FILTERS)
-    assert [(t.chip, t.filter) for t in reference.fitted.tables.tables] == [(1, ""), (2, "")]
-    assert [(t.chip, t.filter) for t in other.fitted.tables.tables] == [
+    assert [(t.chip, t.filter) for t in reference.tables.tables] == [(1, ""), (2, "")]
+    assert [(t.chip, t.filter) for t in other.tables.tables] == [
         *((1, ""), (2, "")),
         *((1, "F814W"), (2, "F814W")),
     ]
-    for a, b in zip(reference.fitted.tables.tables, other.fitted.tables.tables, strict=False):
+    for a, b in zip(reference.tables.tables, other.tables.tables, strict=False):
         np.testing.assert_array_equal(a.values, b.values)
     # pixels are those that both tables have corrected
-    raw, x = other.matched.stars, other.data.placed.x
+    raw, x = other.stars, other.placed.x
     numbers = raw.chip_number
-    both, _ = corrected(other.fitted.tables.tables, raw.x, raw.y, chip=numbers, filter="F814W")
+    both, _ = corrected(other.tables.tables, raw.x, raw.y, chip=numbers, filter="F814W")
     assert len(x) == len(both) and np.array_equal(x, both)
 
 
@@ -117,7 +116,7 @@ def test_the_error_of_the_held_tables_stays_in_the_budget(by_filter):
     grid = other.config.assess.grid  # between its positions errors are interpolated
     for chip in other.fit.model.chips:
         x, y = np.meshgrid(*(np.linspace(1, n, m) for n, m in zip(chip.size, grid, strict=True)))
-        held = held_sigma(other.fitted.tables.tables, x.ravel(), y.ravel(), chip=chip.number)
+        held = held_sigma(other.tables.tables, x.ravel(), y.ravel(), chip=chip.number)
         domain = EvaluationDomain.of_chips(
             other.posterior.model, grid, chips=(chip.number,), epoch=other.epoch
         )
@@ -261,7 +260,7 @@ def test_stwcs_sees_our_model_and_the_true_sky(
     [term] = [one for one in local_errors(by_filter[filter]) if one.name == "look-up tables"]
     for chip in (1, 2):
         theirs = wcs[chip].all_pix2world(np.stack([x, y], axis=1), 1)
-        px, py = corrected(by_filter[filter].fitted.tables.tables, x, y, chip=chip, filter=filter)
+        px, py = corrected(by_filter[filter].tables.tables, x, y, chip=chip, filter=filter)
         ours = model.predict(turned.mean, px, py, epoch=epoch, chip=chip)
         assert separation_mas(to_sky(ours - centre, pointing, v2v3), theirs).max() < 0.1
 
@@ -382,7 +381,7 @@ def test_a_run_that_has_not_converged(runs, tmp_path, monkeypatch):
         poor = replace(posterior.convergence, converged=False, reasons=("R-hat 1.3",))
         return replace(posterior, convergence=poor)
 
-    monkeypatch.setattr(bayesdist.app.results, "load_posterior", doubtful)
+    monkeypatch.setattr("bayesdist.app.run.load_posterior", doubtful)
     refused(tmp_path, runs["F606W"], words=["R-hat 1.3", "--allow-unconverged"])
     good("release", runs["F606W"], "-o", tmp_path / "out", "--allow-unconverged", "-q")
     for path in sorted((tmp_path / "out").glob("*.fits")):

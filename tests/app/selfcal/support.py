@@ -9,7 +9,7 @@ import numpy as np
 from astropy.table import Table
 
 from bayesdist.app.config import load_config
-from bayesdist.app.results import Results
+from bayesdist.app.run import Run
 from bayesdist.app.store.rundir import RunDirectory
 from tests.app.support import after_stages, write_config
 from tests.dithered_fields import DitheredField
@@ -97,13 +97,13 @@ def affine_left(here: np.ndarray, there: np.ndarray, at: np.ndarray, kind: str) 
     return np.column_stack([moved.real, moved.imag])
 
 
-def fitted(folder: Path, config: Path) -> Results:
+def fitted(folder: Path, config: Path) -> Run:
     """Results of a run after its stages 'match' and 'fit'."""
     given, text = load_config(config)
     run = RunDirectory.plan(folder, given, text, config.parent)
     return after_stages(run, "match", "fit", rehearsed=False)
 
 
-def directions(results: Results) -> dict[str, dict[str, Any]]:
+def directions(results: Run) -> dict[str, dict[str, Any]]:
     """What summary.json says of each property of the solution, by name."""
-    return {d["name"]: d for d in results.run.summary["selfcal"]["gauge"]["directions"]}
+    return {d["name"]: d for d in results.directory.summary["selfcal"]["gauge"]["directions"]}

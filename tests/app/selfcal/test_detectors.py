@@ -46,7 +46,7 @@ def test_chips_lie_as_their_stars_say(tmp_path):
     )
     results = fitted(tmp_path / "run", config)
     found = directions(results)
-    model, theta = results.fit.model, results.fitted.parts["solved"].mode.theta
+    model, theta = results.fit.model, results.parts["solved"].mode.theta
     rows = functionals(truth.model, truth.theta)
     # by how much the solution differs from the truth in what both chips say of each other
     off = {name: rows[name] @ (_as_true(results, truth) - truth.theta) for name in rows}
@@ -62,9 +62,9 @@ def test_chips_lie_as_their_stars_say(tmp_path):
 def _as_true(results, truth):
     """The solution, moved along free directions to where the truth has what the gauge holds."""
     theta, null, held = (
-        results.fitted.parts["solved"].mode.theta,
-        results.fitted.parts["solved"].gauge.null,
-        results.fitted.parts["solved"].gauge.held,
+        results.parts["solved"].mode.theta,
+        results.parts["solved"].gauge.null,
+        results.parts["solved"].gauge.held,
     )
     first = theta - null @ np.linalg.solve(null[held], (theta - truth.theta)[held])
     for _ in range(3):  # of a large rotation the moves are not linear
@@ -96,8 +96,8 @@ def test_vafactor_is_applied(tmp_path):
         config = write_selfcal(folder / "input", lists, selfcal=block | {"exposures": "log.ecsv"})
         _log(truth, config.parent, factors if name == "with" else np.ones(8))
         results = fitted(folder / "run", config)
-        sigma = np.sqrt(np.diag(results.fitted.parts["solved"].mode.cov))[at]
-        scales.append((results.fitted.parts["solved"].mode.theta[at], sigma))
+        sigma = np.sqrt(np.diag(results.parts["solved"].mode.cov))[at]
+        scales.append((results.parts["solved"].mode.theta[at], sigma))
     (known, sigma), (unknown, _) = scales
     # the simulated sky is smaller on the detector where the frame's scale is larger: what the
     # frames have without VAFACTOR is VAFACTOR, and with it what is left is its square
@@ -134,11 +134,11 @@ def test_motions_of_stars_that_do_not_move(tmp_path):
     )
     _log(truth, config.parent, np.ones(8))
     results = fitted(tmp_path / "run", config)
-    stars = star_catalogue(results.fitted.parts["solved"].mode)
+    stars = star_catalogue(results.parts["solved"].mode)
     assert stars.values.shape[1] == 4 and stars.epoch == pytest.approx(EPOCHS.mean())
-    assert results.fitted.parts["solved"].gauge.rates == ("drift_u", "drift_v", "spin")
-    assert not results.fitted.parts["solved"].gauge.unnamed
-    assert "motions are relative" in " ".join(results.fitted.parts["solved"].gauge.sentences)
+    assert results.parts["solved"].gauge.rates == ("drift_u", "drift_v", "spin")
+    assert not results.parts["solved"].gauge.unnamed
+    assert "motions are relative" in " ".join(results.parts["solved"].gauge.sentences)
     place, motion = (stars.values[:, k : k + 2] @ [1, 1j] for k in (0, 2))
     sigma = np.sqrt(np.einsum("naa->n", stars.own[:, 2:, 2:]) / 2)
     design = np.column_stack([np.ones(len(stars)), 1j * place]) / sigma[:, None]
@@ -181,11 +181,11 @@ def test_parallaxes(tmp_path):
     known = rng.choice(len(truth.sky), 200, replace=False)
     _on_the_sky(truth.sky[known] - truth.sky.mean(axis=0)).write(config.parent / "reference.ecsv")
     results = fitted(tmp_path / "run", config)
-    assert "parallax" in results.fitted.parts["solved"].gauge.rates
-    assert "parallax of the whole sky" in " ".join(results.fitted.parts["solved"].gauge.sentences)
+    assert "parallax" in results.parts["solved"].gauge.rates
+    assert "parallax of the whole sky" in " ".join(results.parts["solved"].gauge.sentences)
     problem, stars = (
-        results.fitted.parts["solved"].mode.problem,
-        star_catalogue(results.fitted.parts["solved"].mode),
+        results.parts["solved"].mode.problem,
+        star_catalogue(results.parts["solved"].mode),
     )
     whose = d.star[problem.rows[problem.starts[:-1]]]
     sigma = np.sqrt(stars.own[:, 4, 4])
@@ -196,7 +196,7 @@ def test_parallaxes(tmp_path):
     low, high = stats.chi2.ppf([1e-3, 1 - 1e-3], len(pulls) - 1)
     # the distortion's errors come on top of the stars' own
     assert low < (pulls**2).sum() < 1.15 * high
-    table = star_table(results.fitted.parts["solved"].mode, stars)
+    table = star_table(results.parts["solved"].mode, stars)
     assert table["parallax"].unit == "mas" and table["pm_u"].unit == "mas / yr"
 
 
@@ -216,11 +216,9 @@ def _on_the_sky(places: np.ndarray) -> Table:
 
 
 def _stars(results) -> Path:
-    path = results.run / "stars.ecsv"
+    path = results.directory / "stars.ecsv"
     write_table(
-        star_table(
-            results.fitted.parts["solved"].mode, star_catalogue(results.fitted.parts["solved"].mode)
-        ),
+        star_table(results.parts["solved"].mode, star_catalogue(results.parts["solved"].mode)),
         path,
     )
     return path
@@ -239,10 +237,10 @@ def test_a_start_from_an_earlier_run(three_rolls, tmp_path):
     free = np.flatnonzero(before.sigma[: before.model.n_polynomial] > 0)
     # held coefficients are those of the start here, and of no distortion there
     moved = (
-        results.fitted.parts["solved"].gauge.null
+        results.parts["solved"].gauge.null
         @ np.linalg.lstsq(
-            results.fitted.parts["solved"].gauge.null[results.fitted.parts["solved"].gauge.held],
-            (before.mean - results.fit.mean)[results.fitted.parts["solved"].gauge.held],
+            results.parts["solved"].gauge.null[results.parts["solved"].gauge.held],
+            (before.mean - results.fit.mean)[results.parts["solved"].gauge.held],
             rcond=None,
         )[0]
     )

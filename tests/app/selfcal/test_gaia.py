@@ -70,7 +70,7 @@ def solved(data_dir, tmp_path_factory):
 
 def test_gaia_fixes_what_the_detections_leave_open(solved):
     results, _ = solved
-    gauge = summary_of(results.run.path)["selfcal"]["gauge"]
+    gauge = summary_of(results.directory.path)["selfcal"]["gauge"]
     free = [one for one in gauge["directions"] if one["state"] == "free"]
     assert {one["name"] for one in free} >= {"zero_point_u", "zero_point_v", "scale", "rotation"}
     assert {one["fixed_by"] for one in free} == {"reference stars"}
@@ -84,12 +84,12 @@ def test_other_gaia_stars_move_as_was_found(solved, capsys):
     pixels of what the observatory's solution has left: places differ by more than their errors.
     """
     results, others = solved
-    stars = star_catalogue(results.fitted.parts["solved"].mode)
+    stars = star_catalogue(results.parts["solved"].mode)
     there: ReferenceCatalog = others.at(stars.epoch)
     tree = cKDTree(stars.values[:, :2])
     distance, which = tree.query(np.column_stack([there.u, there.v]), distance_upper_bound=0.08)
     pairs = np.flatnonzero(np.isfinite(distance))
-    pairs = pairs[~results.fitted.parts["solved"].mode.problem.priors.informed[which[pairs]]]
+    pairs = pairs[~results.parts["solved"].mode.problem.priors.informed[which[pairs]]]
     which = which[pairs]
     found = {}
     for name, first in (("place", 0), ("motion", 2)):

@@ -61,17 +61,17 @@ def test_scale_and_rotation_from_offsets(truth, offsets):
         # the offsets' own errors, a thousandth of them here, move the lever arm
         assert found[name]["sigma_fixed"] == pytest.approx(SIGMA / lever, rel=5e-3)
     assert found["zero_point_u"]["fixed_by"] == "convention"
-    assert results.run.summary["selfcal"]["gauge"]["held"] == ["u_0_0", "v_0_0"]
+    assert results.directory.summary["selfcal"]["gauge"]["held"] == ["u_0_0", "v_0_0"]
 
 
 def test_offsets_that_contradict_the_detections_are_told(truth, offsets, tmp_path):
     results, table = offsets
-    assert not results.fitted.parts["solved"].contradictions
+    assert not results.parts["solved"].contradictions
     wrong = table.copy()
     wrong["du"][3] += 8 * SIGMA
     config = write_selfcal(tmp_path, list_table(truth), gauge={"offsets": "offsets.ecsv"})
     wrong.write(config.parent / "offsets.ecsv")
-    contradictions = fitted(tmp_path / "run", config).fitted.parts["solved"].contradictions
+    contradictions = fitted(tmp_path / "run", config).parts["solved"].contradictions
     assert any("commanded offsets contradict" in one for one in contradictions)
 
 
@@ -101,7 +101,7 @@ def test_the_scale_is_that_of_the_offsets(truth, offsets):
 
 
 def _pixel(results):
-    return _pixel_of(results.fit.model, results.fitted.parts["solved"].mode.theta)
+    return _pixel_of(results.fit.model, results.parts["solved"].mode.theta)
 
 
 def _pixel_of(model, theta):
@@ -119,7 +119,7 @@ def test_relative_errors_are_the_same_in_every_gauge(free, offsets):
         [
             uncertainty_map(one, grid=(9, 9)).radius
             for one in (
-                gauge_free(results.fit, results.fitted.parts["solved"].gauge.null),
+                gauge_free(results.fit, results.parts["solved"].gauge.null),
                 results.fit,
             )
         ]
@@ -133,7 +133,7 @@ def test_relative_errors_are_the_same_in_every_gauge(free, offsets):
 
 def test_a_free_direction_is_no_relative_error(free):
     """Whatever is added along free directions, relative errors stay."""
-    fit, null = free.fit, free.fitted.parts["solved"].gauge.null
+    fit, null = free.fit, free.parts["solved"].gauge.null
     rng = np.random.default_rng(2)
     move = null @ rng.standard_normal((null.shape[1], 2))
     wider = replace(fit, cov=fit.cov + move @ move.T)
@@ -168,7 +168,7 @@ def test_rolls(tmp_path):
     assert found["scale"]["fixed_by"] == "commanded offsets"
     # offsets see a skew as they see a scale
     assert found["skew_plus"]["fixed_by"] == "commanded offsets"
-    assert len(results.fitted.parts["solved"].gauge.held) == 2
+    assert len(results.parts["solved"].gauge.held) == 2
 
 
 def _references(truth, sigma_mas, n, rng):
@@ -203,15 +203,15 @@ def test_reference_stars(truth, tmp_path):
     for name in ("zero_point_u", "zero_point_v", "scale", "rotation"):
         assert found[name]["state"] == "free"
         assert found[name]["fixed_by"] == "reference stars"
-    assert not results.run.summary["selfcal"]["gauge"]["held"]
-    used = results.fitted.parts["solved"].mode.problem.priors.informed
+    assert not results.directory.summary["selfcal"]["gauge"]["held"]
+    used = results.parts["solved"].mode.problem.priors.informed
     assert used.sum() > 100
     # the closed form for stars whose own detections have no errors: it is the lower bound
-    at = results.fitted.parts["solved"].mode.stars[used]
+    at = results.parts["solved"].mode.stars[used]
     lever = np.sqrt(((at - at.mean(axis=0)) ** 2).sum())
     scale = found["scale"]["sigma_fixed"]
     assert sigma / lever < scale < 2 * sigma / lever
-    stars = star_catalogue(results.fitted.parts["solved"].mode)
+    stars = star_catalogue(results.parts["solved"].mode)
     # every star, reference star or not, lies where the catalogue's sky has it
     where = np.column_stack([table["u"], table["v"]]) * 1000
     distance = np.sqrt(((stars.values[used, None] - where) ** 2).sum(axis=2)).min(axis=1)

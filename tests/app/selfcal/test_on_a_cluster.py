@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bayesdist.app.config import load_config
 from bayesdist.app.config.fit import ComputeBlock
-from bayesdist.app.pipeline import fit, match, read, sample
+from bayesdist.app.pipeline import fit, match, sample
 from bayesdist.infer.selfcal import elimination
 from bayesdist.infer.stars import cluster
 from tests.app.selfcal.support import list_table, small, write_selfcal
+from tests.app.support import in_memory
 from tests.reduced import only_in_full
 
 
@@ -29,13 +29,13 @@ def test_draws_are_those_of_one_process(tmp_path, monkeypatch):
     monkeypatch.setattr(cluster, "ClusterPieces", Counted)
     sections = {"sampler": {"target_ess": 100}, "compute": {"engine": "dask", "workers": 2}}
     path = write_selfcal(tmp_path, list_table(small()), **sections)
-    config, _ = load_config(path)
-    data = fit(match(read(config, tmp_path), config), config, tmp_path)
+    run = fit(match(in_memory(path)))
     assert {elimination.expansion_of, elimination.expansion} == set(passes)
     passes.clear()
-    there = sample(data, config)
+    there = sample(run).posterior
     assert {elimination.log_density, elimination.slope} == set(passes)
-    here = sample(data, config.model_copy(update={"compute": ComputeBlock()}))
+    alone = run.with_config(run.config.model_copy(update={"compute": ComputeBlock()}))
+    here = sample(alone).posterior
     sd = here.theta.std(axis=(0, 1))
     assert (np.abs(there.theta - here.theta) <= 1e-10 * np.maximum(sd, np.abs(here.theta))).all()
     np.testing.assert_allclose(there.log_prob, here.log_prob, rtol=1e-10)

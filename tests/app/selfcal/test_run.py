@@ -13,12 +13,8 @@ from astropy.table import Table
 from lxml import html
 from scipy import stats
 
-from bayesdist.app.config import load_config
-from bayesdist.app.kinds.fit_data import FitData
-from bayesdist.app.kinds.selfcal.fit import fit_selfcal
-from bayesdist.app.kinds.selfcal.inputs import read_selfcal
-from bayesdist.app.kinds.selfcal.matching import match_dithers
-from bayesdist.app.results import results_of
+from bayesdist.app.pipeline import fit, match
+from bayesdist.app.run import Run
 from bayesdist.app.store import as_json
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.infer import load_fit, load_posterior
@@ -26,7 +22,15 @@ from bayesdist.infer.compare.planning import with_information
 from bayesdist.infer.selfcal import gauge_free
 from bayesdist.infer.stars.stars import in_table_order, prepare
 from tests.app.selfcal.support import affine_left
-from tests.app.support import cli, good, one_sentence, snapshot, summary_of, write_config
+from tests.app.support import (
+    cli,
+    good,
+    in_memory,
+    one_sentence,
+    snapshot,
+    summary_of,
+    write_config,
+)
 from tests.reduced import only_in_full
 
 
@@ -42,8 +46,8 @@ def _grid(n: int = 12) -> tuple[np.ndarray, np.ndarray]:
 def test_the_distortion_is_within_its_errors(name, kind, n_free, request):
     """Chi-square of the coefficients, but for the sky's free maps, which theta's null space has."""
     finished = request.getfixturevalue(name)
-    results = results_of(RunDirectory.open(finished.path))
-    posterior, gauge = results.posterior, results.fitted.parts["solved"].gauge
+    results = Run.of(RunDirectory.open(finished.path))
+    posterior, gauge = results.posterior, results.parts["solved"].gauge
     assert gauge.null.shape[1] == gauge.open.shape[1] == n_free
     relative = gauge_free(results.solution, gauge.null)
     model, truth = posterior.model, finished.truth
@@ -84,25 +88,22 @@ def test_false_detections_are_told_as_in_the_posterior(name, request):
 
 def test_functions_find_what_the_run_has_found(one_roll):
     """Lists become stars and a solution without a run's folder, the very ones that a run reads."""
-    config, _ = load_config(one_roll.config)
-    base = one_roll.config.parent
-    matched = match_dithers(read_selfcal(config, base))
-    fitted = fit_selfcal(matched)
+    fitted = fit(match(in_memory(one_roll.config)))
     known = load_fit(one_roll.path / "fit.nc")
-    np.testing.assert_array_equal(fitted.linear.mean, known.mean)
-    np.testing.assert_array_equal(fitted.linear.cov, known.cov)
-    results = results_of(RunDirectory.open(one_roll.path))
+    np.testing.assert_array_equal(fitted.fit.mean, known.mean)
+    np.testing.assert_array_equal(fitted.fit.cov, known.cov)
+    results = Run.of(RunDirectory.open(one_roll.path))
     np.testing.assert_array_equal(
-        fitted.parts["solved"].mode.stars, results.fitted.parts["solved"].mode.stars
+        fitted.parts["solved"].mode.stars, results.parts["solved"].mode.stars
     )
     np.testing.assert_array_equal(
-        fitted.parts["solved"].gauge.held, results.fitted.parts["solved"].gauge.held
+        fitted.parts["solved"].gauge.held, results.parts["solved"].gauge.held
     )
-    assert fitted.parts["solved"].fixed == results.fitted.parts["solved"].fixed
-    made, read = FitData(matched, fitted).stars, results.data.stars
+    assert fitted.parts["solved"].fixed == results.parts["solved"].fixed
+    made, read = fitted.matches, results.matches
     for name in ("x", "u", "sigma_u", "exposure", "row"):
         np.testing.assert_array_equal(getattr(made, name), getattr(read, name))
-    facts, summary = as_json(fitted.facts["selfcal"]), summary_of(one_roll.path)["selfcal"]
+    facts, summary = as_json(fitted.fit_facts["selfcal"]), summary_of(one_roll.path)["selfcal"]
     assert {name: summary[name] for name in facts} == facts
 
 
@@ -110,7 +111,7 @@ def test_stars_are_where_they_were(three_rolls):
     """But for a similarity of the sky, and by the errors of their own detections."""
     stars, truth = Table.read(three_rolls.path / "stars.ecsv"), three_rolls.truth
     found = np.column_stack([stars["u"], stars["v"]])
-    problem = results_of(RunDirectory.open(three_rolls.path)).fitted.parts["solved"].mode.problem
+    problem = Run.of(RunDirectory.open(three_rolls.path)).parts["solved"].mode.problem
     every = np.split(truth.detections.star[problem.rows], problem.starts[1:-1])
     whose = np.array([np.median(one) for one in every]).astype(int)
     assert len(np.unique(whose)) == len(whose) == len(stars)
@@ -309,8 +310,8 @@ def test_new_matches_on_another_sky_test_the_release(bend, three_rolls, tmp_path
 
 def test_more_exposures_are_planned_as_these_are_dithered(three_rolls):
     """Once more as many exposures halve the variance: as a limit by the root of 2 nearer asks."""
-    results = results_of(RunDirectory.open(three_rolls.path))
-    mode = results.fitted.parts["solved"].mode
+    results = Run.of(RunDirectory.open(three_rolls.path))
+    mode = results.parts["solved"].mode
     n = mode.problem.model.n_distortion
     more = with_information(mode.solution, mode.distortion_information)
     before, after = (np.diag(one.cov)[:n] for one in (mode.solution, more))
@@ -338,9 +339,9 @@ def test_requirements_are_judged(three_rolls, tmp_path):
 
 def test_residuals_are_about_the_stars_that_were_fitted(three_rolls):
     """The residuals of a star have no mean: about the mean of the draws they would have one."""
-    results = results_of(RunDirectory.open(three_rolls.path))
+    results = Run.of(RunDirectory.open(three_rolls.path))
     sample = results.diagnostics.sample
-    problem = results.fitted.parts["solved"].mode.problem
+    problem = results.parts["solved"].mode.problem
     n, star = len(problem.starts) - 1, np.empty(problem.rows.max() + 1, int)
     star[problem.rows] = np.repeat(np.arange(n), np.diff(problem.starts))
     assert set(sample.table.row) == set(problem.rows)
@@ -358,6 +359,6 @@ def test_residuals_are_about_the_stars_that_were_fitted(three_rolls):
         return np.abs(of_stars(weight * residual) / np.sqrt(of_stars(weight)))
 
     assert (~doubted).sum() > 50
-    stars, order = prepare(results.fit.model, results.data.stars)
+    stars, order = prepare(results.fit.model, results.matches)
     of_mean = in_table_order(stars.residuals(results.posterior.mean), order)
     assert np.median(pull(sample.residual)) < 0.5 * np.median(pull(of_mean))

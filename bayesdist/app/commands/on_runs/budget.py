@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from bayesdist.app.commands.on_files.position_table import origin_line, read_positions
-from bayesdist.app.results import errors_of, open_results
+from bayesdist.app.run import Run
 from bayesdist.app.screen import number, table_text
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess.budget import TOTAL, ErrorBudget, place_budget
@@ -75,12 +75,12 @@ def budget_at(
             where="budget",
             do="give either --at X Y or --at-table FILE",
         )
-    with open_results(RunDirectory.open(run)) as results:
-        results.run.require("budget", ("fit", "sample"))
-        numbers = [chip_of_model.number for chip_of_model in results.posterior.model.chips]
-        errors = errors_of(results)
-        date = results.epoch if epoch is None else epoch
-        mas = results.config.detector.scale_mas if errors.unit == "pix" else None
+    with Run.of(RunDirectory.open(run)) as opened:
+        opened.directory.require("budget", ("fit", "sample"))
+        numbers = [chip_of_model.number for chip_of_model in opened.posterior.model.chips]
+        errors = opened.drawn_errors
+        date = opened.epoch if epoch is None else epoch
+        mas = opened.config.detector.scale_mas if errors.unit == "pix" else None
         if at_table is not None:
             name = str(at_table)
             table = read_positions(Path(at_table))

@@ -7,12 +7,11 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from bayesdist.app.assessment.error_terms import idle_dates
-from bayesdist.app.config import Config, load_config
-from bayesdist.app.kinds.fit_data import FitData
+from bayesdist.app.config import load_config
 from bayesdist.app.kinds.matches.added_errors import grouping_sentence, in_circle
 from bayesdist.app.kinds.matches.plausibility import doubts_on_stars
 from bayesdist.app.rehearsal import rehearse
-from bayesdist.app.results import Results, open_results
+from bayesdist.app.run import Run
 from bayesdist.app.screen import number
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.infer import Limits
@@ -42,18 +41,17 @@ def check(path: str | Path) -> str:
     config, text = load_config(path)
     config = config.holding_at_most(MEMORY_MB)
     with TemporaryDirectory() as nowhere:
-        run = RunDirectory.plan(nowhere, config, text, Path(path).resolve().parent)
-    with open_results(run) as results:
-        rehearsed = rehearse(results)
-        lines = results.kind.lines(rehearsed.inputs) or _lines(rehearsed)
+        directory = RunDirectory.plan(nowhere, config, text, Path(path).resolve().parent)
+    with Run.of(directory) as run:
+        rehearsed = rehearse(run)
+        lines = run.kind.lines(rehearsed.inputs) or _lines(rehearsed)
         return "\n".join(lines)
 
 
-def _lines(results: Results) -> Iterator[str]:
+def _lines(run: Run) -> Iterator[str]:
     """Lines of text on the fit of matched stars."""
-    data, config = results.data, results.config
-    matches, model, fit, fitted = data.placed, data.model, data.fit, data.fitted
-    sigma = data.shards.survey.reference_sigma
+    matches, model, fit, config = run.placed, run.model, run.fit, run.config
+    sigma = run.shards.survey.reference_sigma
     yield (
         f"matches      {len(matches)} of {matches.n_rows} rows, "
         f"{len(matches.exposure_names)} exposure(s), u and v in {matches.unit}"
@@ -64,13 +62,13 @@ def _lines(results: Results) -> Iterator[str]:
         yield f"left out     {count} rows: {reason}"
     yield (
         f"errors       median {number(sigma)} {matches.unit}"
-        + (" (by magnitude)" if fitted.errors.by_magnitude is not None else "")
+        + (" (by magnitude)" if run.errors.by_magnitude is not None else "")
     )
-    if fitted.grouped is not None:
-        yield f"jitter       {grouping_sentence(fitted.grouped, fit.unit)}"
+    if run.added_errors is not None:
+        yield f"jitter       {grouping_sentence(run.added_errors, fit.unit)}"
     yield f"model        order {model.order}, frames '{model.frames}', {model.n_params} parameters"
     if len(model.chips) > 1:
-        counts = zip(model.chips, data.shards.survey.chips, strict=True)
+        counts = zip(model.chips, run.shards.survey.chips, strict=True)
         yield "chips        " + ", ".join(f"{c.name} {s.n} stars" for c, s in counts)
     yield f"rank         {model.n_params} of {model.n_params}, nothing is degenerate"
     yield f"condition    {number(fit.condition)} (normal matrix, unit diagonal)"
@@ -83,24 +81,25 @@ def _lines(results: Results) -> Iterator[str]:
         yield f"geometry     chip {chip.chip}: {chip.sentence}"
         if matches.tangent_point is not None and chip.mirrored:
             yield f"geometry     {chip.mirrored}"
-    yield _cost(data, config)
+    yield _cost(run)
     idle = idle_dates(config, config.requirements())
     for text in (
-        *doubts_on_stars(data.sample, model, config),
+        *doubts_on_stars(run.sample, model, config),
         *(text for chip in chips for text in chip.warnings),
-        *warnings_of(results.checks),
+        *warnings_of(run.checks),
         *([idle] if idle else []),
     ):
         yield f"WARNING      {text}"
 
 
-def _cost(data: FitData, config: Config) -> str:
+def _cost(run: Run) -> str:
     """Line on the expected passes and seconds, or on why they cannot be predicted."""
-    sampler, n = config.sampler, len(data.shards)
+    config, n = run.config, len(run.shards)
+    sampler = config.sampler
     limits = Limits(sampler.target_ess, sampler.target_rhat)
-    mixture = config.mixture(data.matched.stars.match_radius)
-    n_params = data.model.n_params + len(mixture.hyper)
-    dear = IN_CIRCLE if in_circle(data.matched.stars, config) else 1.0
+    mixture = config.mixture(run.stars.match_radius)
+    n_params = run.model.n_params + len(mixture.hyper)
+    dear = IN_CIRCLE if in_circle(run.stars, config) else 1.0
     per_pass = dear * STAR_S * n
     over = f"over {n} stars, {number(1e3 * per_pass, 2)} ms each"
     search = dear * EXPANSIONS * EXPANSION_S * n + FIXED_S
@@ -109,10 +108,10 @@ def _cost(data: FitData, config: Config) -> str:
         provided = " if the posterior is close to normal, which was not examined"
     else:
         trial = predict_sampling(
-            data.fit,
-            data.shards,
+            run.fit,
+            run.shards,
             outliers=mixture,
-            priors=data.fitted.priors,
+            priors=run.priors,
             seed=sampler.seed,
             ensembles=sampler.ensembles,
             walkers=sampler.walkers,

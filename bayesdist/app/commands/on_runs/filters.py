@@ -13,7 +13,7 @@ import numpy as np
 from astropy.table import Table
 
 from bayesdist.app.kinds.campaign.parts import ExposuresAlone
-from bayesdist.app.kinds.fitted import Fitted
+from bayesdist.app.run import Run
 from bayesdist.errors import InputError
 from bayesdist.infer.series import FilterDependence, Series, TrendModel, filter_dependence
 from bayesdist.infer.solution.solution import Solution
@@ -224,7 +224,7 @@ TERMS = ("A_2", "B_3", "B_2")
 
 def draw_filters(
     folder: Path,
-    fits: Mapping[str, Fitted],
+    runs: Mapping[str, Run],
     solutions: Mapping[str, Solution],
 ) -> tuple[str, ...]:
     """Write filters_A_2.png and so on, and return their names."""
@@ -232,9 +232,9 @@ def draw_filters(
     from bayesdist.report.drawing import save_figures
     from bayesdist.report.figures.commands import FilterTerm, filters_figure
 
-    model = next(iter(fits.values())).linear.model
+    model = next(iter(runs.values())).model
     time = model.time
-    if time is None or len(fits) < 2:
+    if time is None or len(runs) < 2:
         return ()
     views = {
         name: reference_gauge(without_frames(item), model.chips[0].number)
@@ -245,9 +245,9 @@ def draw_filters(
     for term in TERMS:
         courses = []
         for chip in sorted(model.chips, key=lambda c: c.name):
-            for name, fitted in fits.items():
+            for name, run in runs.items():
                 label = f"{chip.name}.{term}"
-                series = fitted.part(ExposuresAlone).series
+                series = run.part(ExposuresAlone).series
                 if label not in series.coefficients:
                     continue
                 segments = [lines(views[name], s, chip=chip.number) for s in range(time.n_segments)]

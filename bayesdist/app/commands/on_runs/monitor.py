@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
+from bayesdist.app.artefacts.stored_fit import load_errors
 from bayesdist.app.commands.on_runs.compare import joined
 from bayesdist.app.config import CampaignConfig, Config, MatchesConfig, load_config
 from bayesdist.app.kinds.campaign.parts import ExposureScatter
-from bayesdist.app.kinds.fitted import load_errors
 from bayesdist.app.kinds.matches.sources import read_configured
-from bayesdist.app.results import Results, results_of
+from bayesdist.app.run import Run
 from bayesdist.app.store.keys import attributes
 from bayesdist.app.store.made_from import input_name
 from bayesdist.app.store.output import record_folder, write_table
@@ -108,7 +108,7 @@ def _fitted(
     run: RunDirectory, config: Config, new: Path
 ) -> tuple[Posterior, Matches, NewFit, tuple[str, ...]]:
     """Release, new matches and their fit, and exposures or files that the release has used."""
-    release = results_of(run)
+    release = Run.of(run)
     if isinstance(config, CampaignConfig):  # new exposures scatter as those of the release do
         return release.solution, *fit_new_exposures(release, new)
     posterior = release.solution
@@ -331,7 +331,7 @@ def _summary(found: Monitored, facts: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def fit_new_exposures(release: Results, new: Path) -> tuple[Matches, NewFit, tuple[str, ...]]:
+def fit_new_exposures(release: Run, new: Path) -> tuple[Matches, NewFit, tuple[str, ...]]:
     """Fit new exposures of a campaign, with deviations drawn from the scatter of the release.
 
     The catalogue error of a star, which is common to all its exposures, is included.  If the
@@ -339,7 +339,7 @@ def fit_new_exposures(release: Results, new: Path) -> tuple[Matches, NewFit, tup
 
     Parameters
     ----------
-    release : Results
+    release : Run
     new : Path
         Run directory of a campaign with completed stage 'match', or a file or folder of pairs as
         stored in a run.  Star lists must be matched first.
@@ -354,7 +354,7 @@ def fit_new_exposures(release: Results, new: Path) -> tuple[Matches, NewFit, tup
         Exposures that are left out because the release was made from them.
     """
     run = RunDirectory(new) if (new / "run.json").exists() else None
-    released, fitted, config = release.solution, release.fitted, release.config
+    released, config = release.solution, release.config
     pairs = _pairs(run, new, released.model.unit)
     if not pairs.has_epoch:
         raise InputError("has no epochs", where=str(new), do="give a column 'epoch'")
@@ -371,12 +371,12 @@ def fit_new_exposures(release: Results, new: Path) -> tuple[Matches, NewFit, tup
         )
     pairs = pairs.select(fresh)
     pairs = pairs.with_exposure_names(pairs.exposures)
-    placed, errors = fitted.placed(pairs), fitted.errors.by_magnitude
+    placed, errors = release.as_placed(pairs), release.errors.by_magnitude
     if run is not None and "fit" in run.record.artefacts:
         errors = load_errors(run.path).by_magnitude or errors
     if placed.mag is not None and errors is not None:
         placed = placed.with_errors(errors, in_quadrature=True)
-    scatter = fitted.part(ExposureScatter)
+    scatter = release.part(ExposureScatter)
     new_fit = fit_new(
         released,
         placed,
@@ -386,8 +386,8 @@ def fit_new_exposures(release: Results, new: Path) -> tuple[Matches, NewFit, tup
     )
     of_catalogue = _catalogue_errors(pairs)
     if of_catalogue is not None:
-        has_same_catalogue = run is not None and _catalogue_of(run) == _catalogue_of(release.run)
-        made_from = (release.data.fit, release.data.stars) if has_same_catalogue else None
+        is_same = run is not None and _catalogue_of(run) == _catalogue_of(release.directory)
+        made_from = (release.fit, release.matches) if is_same else None
         new_fit = with_star_errors_of(of_catalogue, new_fit, placed, made_from)
     return placed, new_fit, left_out
 

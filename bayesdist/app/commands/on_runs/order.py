@@ -10,13 +10,10 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
+from bayesdist.app.artefacts.errors import QUOTED
 from bayesdist.app.config import MatchesConfig, load_config
-from bayesdist.app.kinds.errors import QUOTED
-from bayesdist.app.kinds.fit_data import FitData
-from bayesdist.app.kinds.kind import kind_of
-from bayesdist.app.kinds.matched import Matched
-from bayesdist.app.kinds.matches.stars import fit_stars, model_of, shards_of
-from bayesdist.app.results import Results, open_results
+from bayesdist.app.kinds.matches.stars import model_of, shards_of
+from bayesdist.app.run import Run
 from bayesdist.app.screen import table_text
 from bayesdist.app.store.output import refuse_existing, write_table
 from bayesdist.app.store.rundir import RunDirectory
@@ -29,6 +26,7 @@ from bayesdist.infer.compare.order import OrderSelection, in_one_frame, select_o
 from bayesdist.infer.solution.linear import Rejection
 from bayesdist.model import DistortionModel
 from bayesdist.model.basis import MAX_ORDER
+from bayesdist.plugin import load_object
 
 
 def order(
@@ -77,7 +75,7 @@ def order(
             do=f"give the lowest and the highest, between 1 and {MAX_ORDER}",
         )
     config, text = load_config(path)
-    unsuitable = kind_of(config).no_order
+    unsuitable = load_object(config.kind).no_order
     if unsuitable:
         raise InputError(
             unsuitable,
@@ -87,11 +85,9 @@ def order(
     chips = [chip_of_model.number for chip_of_model in config.chips()]
     number_of = chosen_chip(chips or [1], chip, where=str(path), argument="--chip")
     with TemporaryDirectory() as nowhere:
-        run = RunDirectory.plan(nowhere, config, text, Path(path).resolve().parent)
-        with open_results(run) as results:
-            selection, failed = _selected(
-                results, range(low, high + 1), number_of if chips else None
-            )
+        directory = RunDirectory.plan(nowhere, config, text, Path(path).resolve().parent)
+        with Run.of(directory) as run:
+            selection, failed = _selected(run, range(low, high + 1), number_of if chips else None)
     if output is not None:
         write_table(_table(selection, failed), Path(output))
     if figure is not None:
@@ -100,14 +96,14 @@ def order(
 
 
 def _selected(
-    results: Results, orders: Sequence[int], chip: int | None
+    run: Run, orders: Sequence[int], chip: int | None
 ) -> tuple[OrderSelection, dict[int, str]]:
     """Comparison of orders, and reasons why higher orders cannot be fitted."""
     failed: dict[int, str] = {}
-    matched = results.kind.match(results.inputs, results.config)
+    run = run.kind.match(run)
     for top in sorted(orders, reverse=True):
         try:
-            return _compared(results, matched, range(min(orders), top + 1), chip), failed
+            return _compared(run, range(min(orders), top + 1), chip), failed
         except DegenerateError as error:
             if top <= min(orders) + 1:
                 raise
@@ -115,16 +111,14 @@ def _selected(
     raise AssertionError("the lowest two orders are compared or refused")
 
 
-def _compared(
-    results: Results, matched: Matched, orders: Sequence[int], chip: int | None
-) -> OrderSelection:
+def _compared(run: Run, orders: Sequence[int], chip: int | None) -> OrderSelection:
     """Comparison of orders, based on a configuration of the highest.
 
     Errors by magnitude, tables, frames and drift are those of a fit of that order, because its
     residuals contain the least misfit.
     """
-    config, reader = results.config.of_order(max(orders)), results.reader
-    matched = matched.of_order(max(orders))
+    config = run.config.of_order(max(orders))
+    run = run.with_config(config)
     rejection = Rejection(config.fit.clip_chi2, config.fit.clip_abs)
     stars: Matches | Shards
     one_frame = config.model.frames == "none" and config.time() is None
@@ -132,18 +126,18 @@ def _compared(
     if isinstance(config, MatchesConfig) and len(config.chips()) < 2 and one_frame:
         errors = QUOTED
         if config.data.sigma == "by_magnitude":
-            errors = fit_stars(matched, config, reader=reader).errors
-        model = model_of(matched.stars, config)
-        stars = shards_of(matched.stars, model, config, errors, reader)
+            errors = run.kind.fit(run).errors
+        model = model_of(run.stars, config)
+        stars = shards_of(run.stars, model, config, errors, run.reader)
     else:
-        data = FitData(matched, results.kind.fit(matched, config, results.base, reader), reader)
+        run = run.kind.fit(run)
         chip_of_model = next(
             chip_of_model
-            for chip_of_model in data.model.chips
+            for chip_of_model in run.model.chips
             if chip in (None, chip_of_model.number)
         )
-        model = DistortionModel(max(orders), (chip_of_model,), unit=data.model.unit)
-        stars = in_one_frame(data.fit, data.stars, chip_of_model.number)
+        model = DistortionModel(max(orders), (chip_of_model,), unit=run.model.unit)
+        stars = in_one_frame(run.fit, run.matches, chip_of_model.number)
     return select_order(stars, model, orders=orders, rejection=rejection)
 
 

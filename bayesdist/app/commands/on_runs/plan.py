@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from bayesdist.app.assessment.error_terms import assessment_rng
-from bayesdist.app.results import Results, open_results
+from bayesdist.app.run import Run
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.tables.margins import judged_requirements
 from bayesdist.assess.evaluation import with_measured_centroids
@@ -54,13 +54,13 @@ def plan(run: str | Path, *, name: str | None = None, epochs: Sequence[float] = 
             where=str(run),
             do=f"compare dither patterns by 'bayesdist plan-dither {run}'",
         )
-    with open_results(RunDirectory.open(run)) as results:
-        results.run.require("plan", ("fit", "sample", "diagnose", "evaluate"))
-        exposures = _exposures_of(results)
+    with Run.of(RunDirectory.open(run)) as opened:
+        opened.directory.require("plan", ("fit", "sample", "diagnose", "evaluate"))
+        exposures = _exposures_of(opened)
         if epochs and exposures.dateless:
             raise InputError(exposures.dateless, where=str(run), do="leave --epochs out")
-        content = content_of(results)
-        needs = needs_of(results, content, name=name, epochs=epochs)
+        content = content_of(opened)
+        needs = needs_of(opened, content, name=name, epochs=epochs)
         lines = [exposures.sentence(content)]
     for requirement, several in needs:
         lines.append("")
@@ -73,7 +73,7 @@ def plan(run: str | Path, *, name: str | None = None, epochs: Sequence[float] = 
 
 
 def needs_of(
-    results: Results,
+    run: Run,
     content: ExposureContent,
     *,
     name: str | None = None,
@@ -83,8 +83,8 @@ def needs_of(
 
     Parameters
     ----------
-    results : Results
-        Results of a run that was evaluated.
+    run : Run
+        Run that was evaluated.
     content : ExposureContent
         Average exposure of the run, from `content_of`.
     name : str, optional
@@ -101,20 +101,20 @@ def needs_of(
     InputError
         If there is no such requirement.
     """
-    requirements = judged_requirements(results.run)
+    requirements = judged_requirements(run.directory)
     chosen = [r for r in requirements if name is None or r.name == name]
     if not chosen:
         names = ", ".join(repr(r.name) for r in requirements)
         raise InputError(
             f"has no requirement {name!r}" if names else "has no requirements",
-            where=str(results.run.path),
+            where=str(run.directory.path),
             do=f"name one of {names}" if names else "judge some with 'bayesdist requirements'",
         )
-    now = {row["name"]: row["probability_met"] for row in results.run.summary["margins"]}
-    future, out = futures_of(results, content), []
+    now = {row["name"]: row["probability_met"] for row in run.directory.summary["margins"]}
+    future, out = futures_of(run, content), []
     for requirement in chosen:
         needs = exposures_needed(
-            schedules_of(results, requirement, content, epochs),
+            schedules_of(run, requirement, content, epochs),
             future(requirement).probability,
             requirement.probability,
             now=now[requirement.name],
@@ -123,42 +123,42 @@ def needs_of(
     return out
 
 
-def content_of(results: Results) -> ExposureContent:
+def content_of(run: Run) -> ExposureContent:
     """Average exposure of the run."""
-    stars = results.diagnostics.sample
-    jitter = float(np.mean(results.posterior.hyper.get("j", [0.0])))
+    stars = run.diagnostics.sample
+    jitter = float(np.mean(run.posterior.hyper.get("j", [0.0])))
     sigma = np.stack([np.asarray(stars.table.sigma_u), np.asarray(stars.table.sigma_v)], axis=1)
     true = np.ones(len(stars))
     if stars.outlier_probability is not None:
         true = 1.0 - stars.outlier_probability
     return exposure_content(
-        results.posterior.model,
+        run.posterior.model,
         stars.table,
         true[:, None] / (sigma**2 + jitter**2),
         n_total=stars.n_total,
-        n_exposures=_exposures_of(results).count,
+        n_exposures=_exposures_of(run).count,
     )
 
 
 def schedules_of(
-    results: Results,
+    run: Run,
     requirement: Requirement,
     content: ExposureContent,
     epochs: Sequence[float] = (),
 ) -> list[Schedule]:
     """Schedules of exposures: at relevant dates, or one schedule if dates do not matter."""
-    return _exposures_of(results).schedules(requirement, content, epochs)
+    return _exposures_of(run).schedules(requirement, content, epochs)
 
 
-def futures_of(results: Results, content: ExposureContent) -> Callable[[Requirement], Futures]:
+def futures_of(run: Run, content: ExposureContent) -> Callable[[Requirement], Futures]:
     """Function that predicts the run with more exposures, for any requirement."""
-    settings, errors = results.settings, results.errors
-    errors = with_measured_centroids(errors, results.diagnostics, settings)
-    diagnostics = results.diagnostics
-    hierarchy = results.fitted.hierarchy
+    settings, errors = run.evaluation_settings, run.error_model
+    errors = with_measured_centroids(errors, run.diagnostics, settings)
+    diagnostics = run.diagnostics
+    hierarchy = run.hierarchy
     # further exposures of the same stars do not reduce the effect of catalogue errors
     independent = with_diagnosed_errors(
-        results.posterior, replace(diagnostics, catalogue=None), hierarchy, noise_alone=True
+        run.posterior, replace(diagnostics, catalogue=None), hierarchy, noise_alone=True
     )
 
     def solution(information: Float) -> Solution:
@@ -167,9 +167,9 @@ def futures_of(results: Results, content: ExposureContent) -> Callable[[Requirem
             return extended
         return with_shared_stars(extended, hierarchy, diagnostics.catalogue)
 
-    exposures = _exposures_of(results)
+    exposures = _exposures_of(run)
     weight = np.mean([np.sum([m[axis, 0, 0] for m in content.moments.values()]) for axis in (0, 1)])
-    seed = int(assessment_rng(results.config).integers(2**63))
+    seed = int(assessment_rng(run.config).integers(2**63))
 
     def of(requirement: Requirement) -> Futures:
         return Futures(
@@ -181,7 +181,7 @@ def futures_of(results: Results, content: ExposureContent) -> Callable[[Requirem
             settings.epoch,
             settings.pixel_scale(errors),
             seed,
-            results.config.discrepancy.priors(),
+            run.config.discrepancy.priors(),
         )
 
     return of
@@ -192,18 +192,18 @@ class _Exposures:
 
     gain = 1.0
 
-    def __init__(self, results: Results) -> None:
-        self.results = results
+    def __init__(self, run: Run) -> None:
+        self.run = run
 
     @property
     def count(self) -> int:
         """Number of exposures of the run."""
-        return max(len(self.results.data.placed.exposure_names), 1)
+        return max(len(self.run.placed.exposure_names), 1)
 
     @property
     def dateless(self) -> str:
         """Clause on why dates of further exposures do not matter; empty if they do."""
-        if self.results.solution.model.time is not None:
+        if self.run.solution.model.time is not None:
             return ""
         return "does not depend on time, so that the dates of further exposures do not matter"
 
@@ -215,7 +215,7 @@ class _Exposures:
         self, requirement: Requirement, content: ExposureContent, epochs: Sequence[float]
     ) -> list[Schedule]:
         """Schedules at relevant dates, or one schedule if dates do not matter."""
-        solution, epoch = self.results.solution, self.results.epoch
+        solution, epoch = self.run.solution, self.run.epoch
 
         def worth(date: float | None) -> Float:
             return exposure_information(solution, content, date)
@@ -223,7 +223,7 @@ class _Exposures:
         if solution.model.time is None or epoch is None:
             return [Schedule("at any date", worth(None))]
         wanted = requirement.epoch or (requirement.epochs or [epoch])[-1]
-        last = float(np.max(self.results.diagnostics.sample.table.column("epoch")))
+        last = float(np.max(self.run.diagnostics.sample.table.column("epoch")))
         schedules = [
             Schedule(f"at {date:.2f}", worth(date), single_date=True)
             for date in dict.fromkeys([*epochs, wanted])
@@ -242,8 +242,8 @@ class _DitheredExposures(_Exposures):
         "is a run of a self-calibration, whose exposures count as those at hand with their dates"
     )
 
-    def __init__(self, results: Results, mode: SelfCalibrationMode) -> None:
-        super().__init__(results)
+    def __init__(self, run: Run, mode: SelfCalibrationMode) -> None:
+        super().__init__(run)
         self.mode, self.gain = mode, mode.gain
 
     @property
@@ -260,12 +260,12 @@ class _DitheredExposures(_Exposures):
     ) -> list[Schedule]:
         """One schedule, of the same dithers."""
         information = self.gain * self.mode.distortion_information / self.count
-        further = further_dithers(self.mode, self.results.config.sampler.seed)
+        further = further_dithers(self.mode, self.run.config.sampler.seed)
         return [Schedule("dithered like these", information, together=further)]
 
 
-def _exposures_of(results: Results) -> _Exposures:
+def _exposures_of(run: Run) -> _Exposures:
     """Exposures of a run, with what further ones like them are worth."""
-    mode = results.kind.questions(results.data, results.config).eliminated
+    mode = run.kind.questions(run).eliminated
     # exposures without a catalogue are informative only together, which is another computation
-    return _Exposures(results) if mode is None else _DitheredExposures(results, mode)
+    return _Exposures(run) if mode is None else _DitheredExposures(run, mode)

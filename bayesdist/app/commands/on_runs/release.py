@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack, closing
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from bayesdist.app.assessment.error_terms import published_tables
 from bayesdist.app.commands.on_runs.filters import (
     FilterComparison,
     compare_filters,
@@ -19,9 +18,9 @@ from bayesdist.app.commands.on_runs.filters import (
 from bayesdist.app.config import CampaignConfig
 from bayesdist.app.config.products import ReleaseBlock
 from bayesdist.app.kinds.campaign.parts import ExposuresAlone
-from bayesdist.app.kinds.fitted import Fitted
+from bayesdist.app.products.export import published_tables
 from bayesdist.app.products.release_set import release_set
-from bayesdist.app.results import Results, results_of
+from bayesdist.app.run import Run
 from bayesdist.app.screen import table_text
 from bayesdist.app.store.output import record_folder, write_table
 from bayesdist.app.store.rundir import RunDirectory
@@ -61,17 +60,16 @@ def release_runs(
         Text to print.
     """
     with ExitStack() as stack:
-        by_filter: dict[str, Results] = {}
+        by_filter: dict[str, Run] = {}
         for path in runs:
-            results = stack.enter_context(closing(_opened(path)))
-            filter = results.inputs.filter
-            if filter in by_filter:
+            run = stack.enter_context(_opened(path))
+            if run.filter in by_filter:
                 raise InputError(
-                    f"is of filter {filter}, as {by_filter[filter].run.path} is",
+                    f"is of filter {run.filter}, as {by_filter[run.filter].directory.path} is",
                     where=str(path),
                     do="give one run for each filter",
                 )
-            by_filter[filter] = results
+            by_filter[run.filter] = run
         block = _require_alike(by_filter)
         doubts = _doubts(by_filter, allowed=allow_unconverged)
         solutions = _solutions(by_filter)
@@ -86,16 +84,9 @@ def release_runs(
             tables = _tables(by_filter)
             files = release_set().write(block, chip, first.base, folder, solutions, tables, notes)
             write_table(table, folder / "filters.ecsv")
-            figures = draw_filters(
-                folder,
-                {k: results_of_filter.fitted for k, results_of_filter in by_filter.items()},
-                solutions,
-            )
+            figures = draw_filters(folder, by_filter, solutions)
             record |= {
-                "runs": {
-                    name: str(results_of_filter.run.path)
-                    for name, results_of_filter in by_filter.items()
-                },
+                "runs": {name: str(run.directory.path) for name, run in by_filter.items()},
                 "converged": not doubts,
                 "drift": table.meta["drift"],
                 "products": files,
@@ -106,89 +97,89 @@ def release_runs(
     return _text(Path(output), files, rows, str(table["at_edge"].unit), why_not or None, comparison)
 
 
-def _opened(path: str | Path) -> Results:
-    """Results of a finished run of a campaign."""
-    run = RunDirectory.open(path)
-    if not isinstance(run.config, CampaignConfig):  # only campaigns have filters to release
+def _opened(path: str | Path) -> Run:
+    """Finished run of a campaign."""
+    directory = RunDirectory.open(path)
+    if not isinstance(directory.config, CampaignConfig):  # only campaigns have filters to release
         raise InputError(
             "is no run of a campaign", where=str(path), do="give runs that began with star lists"
         )
-    run.require("release", ("match", "fit", "sample"))
-    return results_of(run)
+    directory.require("release", ("match", "fit", "sample"))
+    return Run.of(directory)
 
 
 # -- compatibility of the runs ---------------------------------------------------------------------
 
 
-def _require_alike(by_filter: Mapping[str, Results]) -> ReleaseBlock:
+def _require_alike(by_filter: Mapping[str, Run]) -> ReleaseBlock:
     """Section of the release in the first run; raises InputError if runs are incompatible."""
     first, *other_runs = by_filter.values()
     block = first.config.products.release
     if block is None:
         raise InputError(
             "has no [products.release], and the first run says what is released",
-            where=str(first.run.path),
+            where=str(first.directory.path),
             do="put the run of the reference filter first",
         )
     mine = _structure(first)
-    for results in other_runs:
-        for name, theirs in _structure(results).items():
+    for run in other_runs:
+        for name, theirs in _structure(run).items():
             if theirs != mine[name]:
                 raise InputError(
-                    f"the {name} are not those of {first.run.path}"
+                    f"the {name} are not those of {first.directory.path}"
                     + (f": {theirs} and {mine[name]}" if name != "chips" else ""),
-                    where=str(results.run.path),
+                    where=str(run.directory.path),
                     do="run both filters with one structure",
                 )
-        if not _same_detector(first.fitted, results.fitted):
+        if not _same_detector(first, run):
             raise InputError(
-                f"the detector's tables are not those of {first.run.path}",
-                where=str(results.run.path),
+                f"the detector's tables are not those of {first.directory.path}",
+                where=str(run.directory.path),
                 do="name that run in tables.detector and run this filter again",
             )
     return block
 
 
-def _structure(results: Results) -> dict[str, Any]:
+def _structure(run: Run) -> dict[str, Any]:
     """Properties that the runs must have in common, by names in the plural."""
-    model, time = results.posterior.model, results.posterior.model.time
+    model, time = run.posterior.model, run.posterior.model.time
     return {
         "chips": model.chips,
         "orders": model.order,
         "units": model.unit,
-        "pixel scales": results.config.detector.scale_mas,
+        "pixel scales": run.config.detector.scale_mas,
         "drifting terms": None if time is None else time.terms,
         "reference dates (RDATE)": None if time is None else time.epoch0,
         "breaks": None if time is None else time.breaks,
     }
 
 
-def _same_detector(a: Fitted, b: Fitted) -> bool:
+def _same_detector(a: Run, b: Run) -> bool:
     """True if two runs have equal detector tables, to the precision of a D2IMFILE."""
     mine, theirs = (
         {
             t.chip: (t.first, t.step, t.values.astype(np.float32))
-            for t in fitted.tables.tables
+            for t in run.tables.tables
             if not t.filter
         }
-        for fitted in (a, b)
+        for run in (a, b)
     )
     return mine.keys() == theirs.keys() and all(
         mine[c][:2] == theirs[c][:2] and np.array_equal(mine[c][2], theirs[c][2]) for c in mine
     )
 
 
-def _doubts(by_filter: Mapping[str, Results], *, allowed: bool) -> list[str]:
+def _doubts(by_filter: Mapping[str, Run], *, allowed: bool) -> list[str]:
     """Sentences on runs that have not converged."""
     out = []
-    for name, results in by_filter.items():
-        convergence = results.posterior.convergence
+    for name, run in by_filter.items():
+        convergence = run.posterior.convergence
         if not convergence.converged:
             why = "; ".join(convergence.reasons)
             if not allowed:
                 raise InputError(
                     f"the run of {name} has not converged ({why})",
-                    where=str(results.run.path),
+                    where=str(run.directory.path),
                     do="resume it with more steps, or release it with --allow-unconverged",
                 )
             out.append(f"NOT CONVERGED: the run of {name} ({why}).")
@@ -198,44 +189,41 @@ def _doubts(by_filter: Mapping[str, Results], *, allowed: bool) -> list[str]:
 # -- content of the release -----------------------------------------------------------------------
 
 
-def _solutions(by_filter: Mapping[str, Results]) -> dict[str, Solution]:
+def _solutions(by_filter: Mapping[str, Run]) -> dict[str, Solution]:
     """Solution of the reference filter, and those of other filters with its drift."""
     (first, reference), *other_filters = by_filter.items()
     out: dict[str, Solution] = {first: reference.solution}
-    for name, results in other_filters:
-        solution: Solution = results.solution
+    for name, run in other_filters:
+        solution: Solution = run.solution
         if solution.model.time is not None:
             solution = with_drift_of(
                 solution,
                 reference.solution,
                 chip=reference.config.chips()[0].number,
-                formal=results.fit,
+                formal=run.fit,
             )
         out[name] = solution
     return out
 
 
-def _tables(by_filter: Mapping[str, Results]) -> list[LookupTable]:
+def _tables(by_filter: Mapping[str, Run]) -> list[LookupTable]:
     """Tables of the detector, once, and those of the filters."""
     published = [
-        published_tables(results.fitted.tables, held=results.config.tables.detector is not None)
-        for results in by_filter.values()
+        published_tables(run.tables, held=run.config.tables.detector is not None)
+        for run in by_filter.values()
     ]
     out = [table for table in published[0] if not table.filter]
     return out + [table for tables in published for table in tables if table.filter]
 
 
-def _compared(by_filter: Mapping[str, Results]) -> tuple[FilterComparison | None, str]:
+def _compared(by_filter: Mapping[str, Run]) -> tuple[FilterComparison | None, str]:
     """Comparison of the filters, or the reason why there is none."""
     if len(by_filter) < 2:
         return None, "not compared: there is one filter"
     first = next(iter(by_filter.values()))
     try:
         comparison = compare_filters(
-            {
-                name: results.fitted.part(ExposuresAlone).series
-                for name, results in by_filter.items()
-            },
+            {name: run.part(ExposuresAlone).series for name, run in by_filter.items()},
             first.posterior.model.time,
             seed=first.config.sampler.seed,
         )
@@ -244,7 +232,7 @@ def _compared(by_filter: Mapping[str, Results]) -> tuple[FilterComparison | None
     return comparison, ""
 
 
-def _notes(by_filter: Mapping[str, Results], comparison: FilterComparison | None) -> list[str]:
+def _notes(by_filter: Mapping[str, Run], comparison: FilterComparison | None) -> list[str]:
     """Lines for HISTORY."""
     if len(by_filter) < 2:
         return []

@@ -7,8 +7,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from bayesdist.app.assessment.error_terms import idle_dates
+from bayesdist.app.assessment.evaluating import margins_of_run, validity_periods_of_run
 from bayesdist.app.config import load_requirements
-from bayesdist.app.results import margins_of, open_results, validity_periods_of
+from bayesdist.app.run import Run
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.tables.margins import margin_rows, margins_text, reasons_of
 from bayesdist.app.tables.result_files import save_margins
@@ -37,18 +38,18 @@ def validate(run: str | Path, requirements: str | Path) -> tuple[str, int]:
     """
     asked = load_requirements(requirements)
     directory = RunDirectory.open(run)
-    with open_results(directory) as results:
+    with Run.of(directory) as opened:
         directory.require("requirements", ("fit", "sample"))
-        asked = results.config.within_field(asked)
+        asked = opened.config.within_field(asked)
         with _named_after(requirements, asked):
-            margins = margins_of(results, asked)
-            periods = validity_periods_of(results, asked)
-        fit, posterior, gauge = results.fit, results.posterior, results.fitted.gauge_words
+            margins = margins_of_run(opened, asked)
+            periods = validity_periods_of_run(opened, asked)
+        fit, posterior, gauge = opened.fit, opened.posterior, opened.gauge_words
         with directory.locked(), directory.judged_by(asked):
             save_margins(directory, fit, posterior, gauge, margins, periods)
         report = directory / "report.html"
         outdated = report.exists() and not directory.done("report")
-    idle = idle_dates(results.config, asked, str(requirements))
+    idle = idle_dates(opened.config, asked, str(requirements))
     lines = [*_lines(margins), *(period.sentence for period in periods)]
     lines += [f"WARNING: {idle}"] if idle else []
     if outdated:

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from contextlib import closing
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
+from bayesdist.app.artefacts.errors import ErrorLaw
 from bayesdist.app.kinds.campaign.input_validation import frames_not_set
 from bayesdist.app.kinds.campaign.inputs import Inputs
 from bayesdist.app.kinds.campaign.linear_terms import FIXED, gap_priors, line_sections, with_gap
-from bayesdist.app.kinds.campaign.matched import CampaignMatched
+from bayesdist.app.kinds.campaign.matched import affine_model_of
 from bayesdist.app.kinds.campaign.parts import ExposuresAlone, ExposureScatter
 from bayesdist.app.kinds.campaign.reference import rate_priors
 from bayesdist.app.kinds.campaign.tables import fit_tables, scatter_by_magnitude, tables_section
-from bayesdist.app.kinds.errors import ErrorLaw
-from bayesdist.app.kinds.fitted import Fitted
+from bayesdist.app.run import Run
 from bayesdist.data import centroid_errors
 from bayesdist.data.matches import Matches
 from bayesdist.infer import load
@@ -36,16 +37,17 @@ from bayesdist.utils.limits import TREND
 SERIES = ("A_2", "A_3", "B_1", "B_2", "B_3")
 
 
-def fit_campaign(matched: CampaignMatched) -> Fitted:
+def fit_campaign(run: Run) -> Run:
     """Fit the look-up tables, the errors, all exposures jointly, and each exposure alone."""
     with frames_not_set():
-        return _fitted(matched)
+        return run.having(**_fitted(run.stars, run.inputs))
 
 
-def _fitted(matched: CampaignMatched) -> Fitted:
-    inputs, config, affine = matched.inputs, matched.inputs.config, matched.affine_model
-    tables, fit_of_tables = fit_tables(matched)
-    pairs = matched.stars
+def _fitted(pairs: Matches, inputs: Inputs) -> dict[str, Any]:
+    """Artefacts of the stage 'fit' by their names."""
+    config = inputs.config
+    affine = affine_model_of(config, pairs)
+    tables, fit_of_tables = fit_tables(pairs, inputs)
     if tables.tables:
         pairs = on_the_chips(corrected_matches(tables.tables, pairs), affine)
     _, _, total = scatter_by_magnitude(pairs, affine, inputs)
@@ -66,17 +68,17 @@ def _fitted(matched: CampaignMatched) -> Fitted:
         "exposures_skipped": dict(alone.skipped),
         "exposures_outlying": list(joint.outlying),
     }
-    return Fitted(
-        joint.fit,
-        errors,
-        joint.priors,
-        parts={
+    return {
+        "fit": joint.fit,
+        "errors": errors,
+        "priors": joint.priors,
+        "parts": {
             "tables": tables,
             "scatter": ExposureScatter(joint.scatter.kinds, joint.tau_draws, joint.settling),
             "alone": ExposuresAlone(_series(alone, joint.model.chips[0])),
         },
-        facts=facts,
-    )
+        "fit_facts": facts,
+    }
 
 
 def _joint(

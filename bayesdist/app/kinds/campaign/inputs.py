@@ -10,7 +10,7 @@ import numpy as np
 from bayesdist.app.config import CampaignConfig
 from bayesdist.app.config.campaign import CampaignBlock
 from bayesdist.app.kinds.campaign.reference import held_tables
-from bayesdist.app.kinds.matched import Outline, columns_by_code
+from bayesdist.app.kinds.kind import Outline
 from bayesdist.app.kinds.star_lists import StarLists, lists_of
 from bayesdist.calibration.plane import ARCSEC
 from bayesdist.data import (
@@ -220,11 +220,11 @@ def errors_by_star(catalog: ReferenceCatalog, largest_vafactor: float = 1.0) -> 
     `largest_vafactor` is the factor that catalogue positions were divided by.  A star in several
     exposures has one error, because the factors differ by less than 1e-4.
     """
-    position = columns_by_code(catalog, "sigma_u", "sigma_v")
+    position = catalog.by_code("sigma_u", "sigma_v")
     if position is None or not position.any():
         return None
-    motion = columns_by_code(catalog, "sigma_pm_u", "sigma_pm_v")
-    epoch = columns_by_code(catalog, "epoch")
+    motion = catalog.by_code("sigma_pm_u", "sigma_pm_v")
+    epoch = catalog.by_code("epoch")
     return StarErrors(
         position / largest_vafactor,
         None if motion is None else motion / largest_vafactor,

@@ -3,38 +3,45 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from bayesdist.app.config import CampaignConfig, Config
+from bayesdist.app.artefacts.parts import TABLES, read_tables
+from bayesdist.app.artefacts.stored_fit import read_stored_fit
+from bayesdist.app.config import CampaignConfig
 from bayesdist.app.kinds.campaign.checks import campaign_checks
 from bayesdist.app.kinds.campaign.fit import fit_campaign
 from bayesdist.app.kinds.campaign.input_validation import refuse_campaign
-from bayesdist.app.kinds.campaign.inputs import Inputs, outline_of_campaign, read_campaign
+from bayesdist.app.kinds.campaign.inputs import (
+    Inputs,
+    errors_by_star,
+    outline_of_campaign,
+    read_campaign,
+)
 from bayesdist.app.kinds.campaign.linear_terms import line_sections
-from bayesdist.app.kinds.campaign.matched import CampaignMatched, load_matched_campaign
+from bayesdist.app.kinds.campaign.matched import (
+    aberration_term,
+    load_matched_campaign,
+    overlap_of,
+)
 from bayesdist.app.kinds.campaign.matching import campaign_lines, match_lists
 from bayesdist.app.kinds.campaign.parts import ExposureScatter
-from bayesdist.app.kinds.fit_data import FitData, StarReader, assessment_epoch
-from bayesdist.app.kinds.fitted import Fitted, load_fitted
-from bayesdist.app.kinds.kind import EvaluationDomain, Questions, RunKind
-from bayesdist.app.kinds.matched import Outline
-from bayesdist.app.kinds.parts import TABLES, read_tables
+from bayesdist.app.kinds.kind import EvaluationDomain, Outline, Questions, RunKind
 from bayesdist.app.kinds.sampling import sample_stars
-from bayesdist.app.store.rundir import RunDirectory
-from bayesdist.assess.evaluation import EvaluationSettings
-from bayesdist.assess.model import ErrorModel, with_diagnosed_errors
+from bayesdist.app.run import Run
+from bayesdist.assess.model import with_diagnosed_errors
 from bayesdist.assess.terms.correlated import LocalErrors, interpolation_term
 from bayesdist.assess.terms.forms import GIVEN, MEASURED, ErrorTerm
 from bayesdist.assess.terms.parameters import ExposureVariation
-from bayesdist.diagnose.diagnostics import Diagnostics
+from bayesdist.data import ReferenceCatalog
 from bayesdist.diagnose.holdout.predictive import ExposureDeviations, Predictive, predictive_of
+from bayesdist.diagnose.overlap import OverlapTest
 from bayesdist.infer import Posterior
-from bayesdist.infer.catalogue.star_errors import StarInfluence, star_influence
+from bayesdist.infer.catalogue.star_errors import StarErrors, StarInfluence, star_influence
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.utils.checks import Check
 
@@ -42,8 +49,11 @@ SAMPLING = 1  # number of the random stream of the stage 'sample', derived from 
 TOGETHER = 1.5  # node spacings over which errors of tables are correlated, from their covariance
 
 
-class CampaignKind(RunKind[CampaignConfig, Inputs, CampaignMatched]):
+class CampaignKind(RunKind[CampaignConfig, Inputs]):
     """Star lists, which are matched to a reference catalogue; exposures are fitted jointly."""
+
+    section = "matching"
+    along_detector = True
 
     def read(self, config: CampaignConfig, base: Path) -> Inputs:
         """Catalogue, exposure log and star lists."""
@@ -61,31 +71,32 @@ class CampaignKind(RunKind[CampaignConfig, Inputs, CampaignMatched]):
         """Shape of the solution, with its look-up tables."""
         return outline_of_campaign(inputs)
 
-    def match(self, inputs: Inputs, config: CampaignConfig) -> CampaignMatched:
-        """Stars that match the catalogue."""
-        return match_lists(inputs)
+    def with_config(self, inputs: Inputs, config: CampaignConfig) -> Inputs:
+        """Inputs for another configuration, which differs in the model only."""
+        return replace(inputs, config=config)
 
-    def load_matched(
-        self, folder: Path, inputs: Inputs, config: CampaignConfig, summary: Mapping[str, Any]
-    ) -> CampaignMatched:
-        """Pairs of an earlier stage."""
-        return load_matched_campaign(folder, inputs, summary)
+    def match(self, run: Run) -> Run:
+        """Run with the stars that match the catalogue."""
+        return match_lists(run)
 
-    def fit(
-        self, matched: CampaignMatched, config: CampaignConfig, base: Path, reader: StarReader
-    ) -> Fitted:
-        """Look-up tables, errors, all exposures jointly, and each exposure alone."""
-        return fit_campaign(matched)
+    def load_matched(self, run: Run) -> Run:
+        """Run with the pairs of an earlier stage."""
+        return load_matched_campaign(run)
 
-    def load_fitted(self, folder: Path, matched: Callable[[], CampaignMatched]) -> Fitted:
-        """Fit of an earlier stage with its look-up tables."""
-        fitted = load_fitted(folder)
+    def fit(self, run: Run) -> Run:
+        """Run with look-up tables, errors, and all exposures fitted jointly and each alone."""
+        return fit_campaign(run)
+
+    def load_fit(self, run: Run) -> Run:
+        """Run with the fit of an earlier stage and its look-up tables."""
+        folder = run.directory.path
+        artefacts = read_stored_fit(folder)
         tables = read_tables(folder / TABLES, do="run the stage 'fit' again")
-        return replace(fitted, parts={"tables": tables, **fitted.parts})
+        return run.having(**{**artefacts, "parts": {"tables": tables, **artefacts["parts"]}})
 
-    def fit_notes(self, data: FitData, config: CampaignConfig) -> Iterator[tuple[int, str]]:
+    def fit_notes(self, run: Run) -> Iterator[tuple[int, str]]:
         """Warnings about deviations of the exposures, and the scatter of the exposures."""
-        facts = data.fitted.facts
+        facts = run.fit_facts
         for text in facts["deviations"]["warnings"]:
             yield logging.WARNING, text
         sizes = ", ".join(f"{name} {term['value']:.2g}" for name, term in facts["scatter"].items())
@@ -93,123 +104,119 @@ class CampaignKind(RunKind[CampaignConfig, Inputs, CampaignMatched]):
 
     def sample(
         self,
-        data: FitData,
-        config: Config,
+        run: Run,
         *,
         folder: Path | None = None,
         progress: Callable[[int, int], None] | None = None,
     ) -> Posterior:
         """Posterior in which each chip has its mean position over the exposures."""
-        posterior = sample_stars(data, config, folder=folder, progress=progress)
-        rng = np.random.default_rng([config.sampler.seed, SAMPLING])
-        return data.fitted.part(ExposureScatter).averaged(posterior, rng)
+        posterior = sample_stars(run, folder=folder, progress=progress)
+        rng = np.random.default_rng([run.config.sampler.seed, SAMPLING])
+        return run.part(ExposureScatter).averaged(posterior, rng)
 
-    def questions(self, data: FitData, config: CampaignConfig) -> Questions:
+    def questions(self, run: Run) -> Questions:
         """Structure is tested if no tables were fitted; their errors are in the budget."""
         return Questions(
-            centroid=data.fitted.errors.by_magnitude,
-            structure=config.tables.method == "none",
+            centroid=run.errors.by_magnitude,
+            structure=run.config.tables.method == "none",
             exposures=False,
-            settling=data.fitted.part(ExposureScatter).offsets,
+            settling=run.part(ExposureScatter).offsets,
         )
 
-    def save_diagnosed(
-        self,
-        run: RunDirectory,
-        data: FitData,
-        posterior: Posterior,
-        diagnostics: Diagnostics,
-        config: CampaignConfig,
-    ) -> None:
+    def overlap(self, run: Run) -> OverlapTest | None:
+        """Comparison of two exposures far apart in time; None if there is no such pair."""
+        return overlap_of(run)
+
+    def save_diagnosed(self, run: Run) -> None:
         """Write the linear terms of the exposures as a function of time."""
         from bayesdist.app.kinds.campaign import series  # slow to import
 
-        series.write_series_tables(run, data.fitted, config)
+        series.write_series_tables(run)
 
-    def predictive(
-        self,
-        posterior: Posterior,
-        diagnostics: Diagnostics,
-        errors: ErrorModel,
-        data: FitData,
-        settings: EvaluationSettings,
-    ) -> Predictive:
+    def predictive(self, run: Run) -> Predictive:
         """Prediction with the scatter of exposures, and errors of catalogue and tables."""
-        scatter = data.fitted.part(ExposureScatter)
-        cell, tables = None, data.fitted.tables.tables
+        scatter, settings = run.part(ExposureScatter), run.evaluation_settings
+        cell, tables = None, run.tables.tables
         if tables:
             across, up = tables[0].step
             cell = TOGETHER * across, TOGETHER * up
         return replace(
-            predictive_of(with_diagnosed_errors(posterior, diagnostics, data.fit)),
+            predictive_of(with_diagnosed_errors(run.posterior, run.diagnostics, run.fit)),
             deviations=ExposureDeviations(scatter.kinds, scatter.tau),
-            stars=_reference_stars(data),
-            local=errors.local_tables(settings.grid, settings.epoch),
+            stars=_reference_stars(run),
+            local=run.error_model.local_tables(settings.grid, settings.epoch),
             cell=cell,
         )
 
-    def error_terms(self, solution: Solution, data: FitData, config: Config) -> list[ErrorTerm]:
+    def error_terms(self, run: Run, solution: Solution) -> list[ErrorTerm]:
         """Deviation of a new exposure, errors of the tables, and what the user states.
 
         The deviation is the measured scatter, which includes velocity aberration.
         """
-        scatter = data.fitted.part(ExposureScatter)
+        scatter, config = run.part(ExposureScatter), run.config
         deviation = ExposureVariation(
             solution.model,
             np.asarray(solution.mean, float),
             scatter.kinds,
             scatter.tau,
-            aberration=data.matched.aberration(scatter.kinds, scatter.tau, solution),
+            aberration=aberration_term(scatter.kinds, scatter.tau, run.inputs, solution),
         )
         stated = config.user_terms(solution.model.unit)
-        tables = _table_terms(solution, data, config)
+        tables = _table_terms(run, solution)
         return [deviation, *config.linear_terms(solution), *tables, *stated]
 
-    def domain(self, data: FitData, config: Config) -> EvaluationDomain:
+    def domain(self, run: Run) -> EvaluationDomain:
         """A new exposure, whose user fits shift and rotation."""
-        return EvaluationDomain(aligned=True, structure_left=not data.fitted.tables.position_sigma)
+        return EvaluationDomain(aligned=True, structure_left=not run.tables.position_sigma)
 
-    def checks(self, data: FitData, series: Mapping[str, Any]) -> tuple[Check, ...]:
+    def checks(self, run: Run) -> tuple[Check, ...]:
         """Checks of matching, look-up tables and exposures."""
-        facts = {data.matched.section: data.matched.facts, **data.fitted.facts}
-        return campaign_checks(facts | {"time_dependence": series})
+        facts = {self.section: run.match_facts, **run.fit_facts}
+        return campaign_checks(facts | {"time_dependence": run.time_dependence})
 
-    def evaluation_sections(self, solution: Solution, config: CampaignConfig) -> dict[str, Any]:
+    def evaluation_sections(self, run: Run) -> dict[str, Any]:
         """Linear terms as lines in time."""
-        return line_sections(solution, config.chips()[0].number)
+        return line_sections(run.solution, run.config.chips()[0].number)
 
-    def report_parts(
-        self,
-        run: RunDirectory,
-        data: FitData,
-        posterior: Posterior,
-        diagnostics: Diagnostics,
-        epoch: float | None,
-    ) -> dict[str, Any]:
+    def report_parts(self, run: Run) -> dict[str, Any]:
         """Catalogue, matching, tables and series, and the words of a campaign."""
         from bayesdist.app.kinds.campaign.report import report_fields  # needed by one stage
 
-        return report_fields(run, data, posterior, diagnostics.overlap)
+        return report_fields(run)
+
+    def catalogue(self, run: Run) -> ReferenceCatalog:
+        """Reference catalogue with the stars that are used."""
+        inputs: Inputs = run.inputs
+        return inputs.catalog
+
+    def star_errors(self, run: Run) -> StarErrors | None:
+        """Errors of the catalogue by star code; None if there are none."""
+        inputs: Inputs = run.inputs
+        return errors_by_star(inputs.catalog, inputs.largest_vafactor)
+
+    def filter(self, run: Run) -> str:
+        """Filter of the exposures."""
+        inputs: Inputs = run.inputs
+        return inputs.filter
 
 
-def _reference_stars(data: FitData) -> StarInfluence | None:
+def _reference_stars(run: Run) -> StarInfluence | None:
     """Influence of the catalogue errors on the fit, for stars of exposures held out entirely.
 
     These stars were fitted in other exposures, which does not show in their residuals.
     """
-    errors, held = data.matched.star_errors, data.matched.held
+    errors, held = run.kind.star_errors(run), run.held_stars
     if errors is None or held is None or held.star is None:
         return None
-    is_held = np.isin(held.exposure_names, data.matched.whole)
+    is_held = np.isin(held.exposure_names, run.held_exposures)
     codes = np.unique(held.star[is_held[held.exposure]])
-    return star_influence(data.fit, data.stars, errors, codes)
+    return star_influence(run.fit, run.matches, errors, codes)
 
 
-def _table_terms(solution: Solution, data: FitData, config: Config) -> tuple[LocalErrors, ...]:
+def _table_terms(run: Run, solution: Solution) -> tuple[LocalErrors, ...]:
     """Terms for the errors of the tables, and for the distortion between their nodes."""
-    stored, block = data.fitted.tables, config.tables
-    epoch = assessment_epoch(data, config)
-    between = interpolation_term(stored.between, solution, grid=config.assess.grid, epoch=epoch)
+    stored, block, grid = run.tables, run.config.tables, run.config.assess.grid
+    between = interpolation_term(stored.between, solution, grid=grid, epoch=run.epoch)
     if not stored.position_sigma:
         return between
     source = MEASURED

@@ -1,29 +1,29 @@
-"""Matched stars of a campaign, with the lists, catalogue and log that they come from."""
+"""Matched stars of a campaign, and what follows from the lists, catalogue and log."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any
 
 import numpy as np
+from astropy.table import Table
 
+from bayesdist.app.artefacts.holdout import set_aside
+from bayesdist.app.artefacts.parts import Part
 from bayesdist.app.config import CampaignConfig
-from bayesdist.app.kinds.campaign.inputs import Inputs, errors_by_star
-from bayesdist.app.kinds.matched import Matched, set_aside
+from bayesdist.app.kinds.campaign.inputs import Inputs
 from bayesdist.app.kinds.star_lists import known_calibration
+from bayesdist.app.run import Run
 from bayesdist.app.store.rundir import PAIRS, part_files
 from bayesdist.assess.terms.parameters import ABERRATION, EXPOSURE_SCATTER, ScaleError
 from bayesdist.data import read_matches, write_partitioned
 from bayesdist.data.matches import Matches
 from bayesdist.diagnose.overlap import OverlapTest, overlap_test
-from bayesdist.infer import Posterior
-from bayesdist.infer.catalogue.star_errors import StarErrors
 from bayesdist.infer.solution.solution import Solution
-from bayesdist.model import DistortionModel, LookupTable
+from bayesdist.model import DistortionModel
 from bayesdist.products.registry import open_document
 from bayesdist.utils.arrays import Float
 
@@ -31,66 +31,46 @@ GAUGE_EXPOSURES = 1  # leading exposures that define the gauge and cannot be hel
 
 
 @dataclass(frozen=True, eq=False)
-class CampaignMatched(Matched):
+class MatchedPairs(Part):
     """Raw pixels matched with aberration-corrected catalogue positions and their errors."""
 
-    section: ClassVar[str] = "matching"
-    along_detector: ClassVar[bool] = True
+    title = "matched pairs"
+    stage = "match"
 
-    inputs: Inputs = field(kw_only=True)  # catalogue, exposures and star lists
-    pairs: Matches = field(kw_only=True)  # all matches, fitted or held out
-
-    @cached_property
-    def affine_model(self) -> DistortionModel:
-        """Configured polynomial with a free linear part for each exposure."""
-        return affine_model_of(self.inputs.config, self.stars)
-
-    def of_order(self, order: int) -> Self:
-        """Matches to be fitted by polynomials of another order."""
-        config = self.inputs.config.of_order(order)
-        return replace(self, inputs=replace(self.inputs, config=config))
-
-    @property
-    def filter(self) -> str:
-        """Filter of the exposures."""
-        return self.inputs.filter
-
-    @property
-    def star_errors(self) -> StarErrors | None:
-        """Errors of the catalogue by star code; None if there are none."""
-        return errors_by_star(self.inputs.catalog, self.inputs.largest_vafactor)
-
-    def aberration(self, kinds: Sequence[str], tau: Float, solution: Solution) -> ScaleError:
-        """Scale error by velocity aberration, which is a part of the exposure scatter."""
-        return aberration_term(kinds, tau, self.inputs, solution)
-
-    def overlap(self, posterior: Posterior, tables: tuple[LookupTable, ...]) -> OverlapTest | None:
-        """Comparison of two exposures far apart in time; None if there is no such pair."""
-        inputs, block = self.inputs, self.inputs.config.campaign
-        initial = open_document(inputs.base / block.initial_distortion)
-        return overlap_test(
-            self.stars,
-            posterior,
-            known_calibration(initial, block.filter, inputs.config.detector.size),
-            tables,
-            unit_arcsec=inputs.unit_arcsec,
-            pixel=inputs.pixel_arcsec,
-            rolls={exposure.name: exposure.pa_v3 for exposure in inputs.log},
-        )
+    pairs: Matches  # all matches, fitted or held out
 
     def save(self, folder: Path) -> None:
-        """Write the matches to the folder of a run."""
-        super().save(folder)
+        """Write the pairs to the folder of a run."""
         for stale in part_files(folder / PAIRS):
             stale.unlink()
         write_partitioned([self.pairs], folder / PAIRS)
 
 
-def matched_campaign(pairs: Matches, inputs: Inputs, **more: Any) -> CampaignMatched:
-    """Matches of a campaign, divided into fitted and held-out stars as configured."""
+def with_pairs(
+    run: Run, pairs: Matches, facts: Mapping[str, Any], table: Table | None = None
+) -> Run:
+    """Run with the matches of a campaign, fitted and held out as configured.
+
+    Parameters
+    ----------
+    run : Run
+    pairs : Matches
+    facts : mapping of str to object
+        Section 'matching' of summary.json.
+    table : Table, optional
+        One row per exposure.
+    """
+    inputs: Inputs = run.inputs
     pairs = pairs.named_below(str(inputs.base))
-    parts = set_aside(inputs.config, pairs, GAUGE_EXPOSURES)
-    return CampaignMatched(*parts, catalogue=inputs.catalog, inputs=inputs, pairs=pairs, **more)
+    stars, held, exposures = set_aside(inputs.config, pairs, GAUGE_EXPOSURES)
+    return run.having(
+        stars=stars,
+        held_stars=held,
+        held_exposures=exposures,
+        match_facts=facts,
+        match_table=table,
+        match_parts={"pairs": MatchedPairs(pairs)},
+    )
 
 
 def affine_model_of(config: CampaignConfig, stars: Matches) -> DistortionModel:
@@ -108,12 +88,35 @@ def affine_model_of(config: CampaignConfig, stars: Matches) -> DistortionModel:
     )
 
 
-def load_matched_campaign(
-    folder: Path, inputs: Inputs, summary: Mapping[str, Any]
-) -> CampaignMatched:
-    """Load the matches of an earlier stage from the folder of a run."""
-    pairs = read_matches(folder / PAIRS, unit=inputs.catalog.unit)
-    return matched_campaign(pairs, inputs, facts=summary.get("matching", {}))
+def load_matched_campaign(run: Run) -> Run:
+    """Run with the matches of an earlier stage, from its folder."""
+    inputs: Inputs = run.inputs
+    pairs = read_matches(run.directory / PAIRS, unit=inputs.catalog.unit)
+    return with_pairs(run, pairs, run.directory.summary.get("matching", {}))
+
+
+def is_mirrored(facts: Mapping[str, Any]) -> bool:
+    """True if u has the opposite sign to that of the catalogue.
+
+    `facts` is the section 'matching' of summary.json.
+    """
+    return facts.get("parity") == "mirrored"
+
+
+def overlap_of(run: Run) -> OverlapTest | None:
+    """Comparison of two exposures far apart in time; None if there is no such pair."""
+    inputs: Inputs = run.inputs
+    block = inputs.config.campaign
+    initial = open_document(inputs.base / block.initial_distortion)
+    return overlap_test(
+        run.stars,
+        run.posterior,
+        known_calibration(initial, block.filter, inputs.config.detector.size),
+        run.tables.tables,
+        unit_arcsec=inputs.unit_arcsec,
+        pixel=inputs.pixel_arcsec,
+        rolls={exposure.name: exposure.pa_v3 for exposure in inputs.log},
+    )
 
 
 # Cox & Gilliland (2002, HST Calibration Workshop): the scale varies by up to 5e-5 over an orbit

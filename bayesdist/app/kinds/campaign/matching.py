@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -16,13 +16,14 @@ from bayesdist.app.kinds.campaign.input_validation import (
     shear_warnings,
 )
 from bayesdist.app.kinds.campaign.inputs import Inputs, parities_of
-from bayesdist.app.kinds.campaign.matched import CampaignMatched, matched_campaign
+from bayesdist.app.kinds.campaign.matched import is_mirrored, with_pairs
 from bayesdist.app.kinds.star_lists import (
     StarLists,
     known_calibration,
     positions_by_chip,
     start_of,
 )
+from bayesdist.app.run import Run
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.data import (
     Detections,
@@ -41,8 +42,9 @@ from bayesdist.products.registry import open_document
 log = logging.getLogger("bayesdist")
 
 
-def match_lists(inputs: Inputs) -> CampaignMatched:
+def match_lists(run: Run) -> Run:
     """Match star lists with a catalogue, exposure by exposure."""
+    inputs: Inputs = run.inputs
     config, block, lists = inputs.config, inputs.config.campaign, inputs.star_lists
     document = open_document(inputs.base / block.initial_distortion)
     initial = known_calibration(document, block.filter, config.detector.size)
@@ -73,13 +75,13 @@ def match_lists(inputs: Inputs) -> CampaignMatched:
     ]
     pairs = neutralise_aberration(matches.table, inputs.log)
     facts = _facts(matches, table, inputs, warnings)
-    matched = matched_campaign(pairs, inputs, facts=facts, table=table)
-    if matched.held is not None:
-        _refuse_bare(matched.stars, config.chips(), "what is not held out")
-        fitted_log = inputs.log.select(names=matched.stars.exposure_names)
+    run = with_pairs(run, pairs, facts, table)
+    if run.held_stars is not None:
+        _refuse_bare(run.stars, config.chips(), "what is not held out")
+        fitted_log = inputs.log.select(names=run.stars.exposure_names)
         refuse_few(fitted_log.values("epoch"), config.time() if config.has_free_rates else None)
-    _log(matched, int(table["detected"].sum()))
-    return matched
+    _log(facts, int(table["detected"].sum()))
+    return run
 
 
 def _table(found: CampaignMatches, exposures: ExposureLog) -> Table:
@@ -116,8 +118,7 @@ def _facts(
     }
 
 
-def _log(matched: CampaignMatched, n_detected: int) -> None:
-    facts = matched.facts
+def _log(facts: Mapping[str, Any], n_detected: int) -> None:
     log.info(
         "match: %d pairs of %d detections in %d exposures, median completeness %.3f, %.2g false",
         facts["n_pairs"],
@@ -126,13 +127,13 @@ def _log(matched: CampaignMatched, n_detected: int) -> None:
         facts["completeness"]["median"],
         facts["false_fraction"],
     )
-    if matched.mirrored:
+    if is_mirrored(facts):
         log.info(
             "match: the catalogue is mirrored against the detector's axes: u is taken with the "
             "opposite sign%s",
             "" if facts["tangent_point"] is None else " and grows to the west",
         )
-    for text in matched.warnings:
+    for text in facts["warnings"]:
         log.warning("match: WARNING: %s", text)
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bayesdist.app.kinds.parts import Part
+from bayesdist.app.artefacts.parts import Part
 from bayesdist.infer import Posterior
 from bayesdist.infer.exposures.hierarchy import Settling
 from bayesdist.infer.series import Series

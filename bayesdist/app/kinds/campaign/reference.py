@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from bayesdist.app.artefacts.parts import read_tables
+from bayesdist.app.artefacts.stored_fit import converged_posterior
 from bayesdist.app.config import Config
 from bayesdist.app.config.model import TablesBlock
 from bayesdist.app.config.run import TABLES, rates_file, tables_file
 from bayesdist.app.kinds.campaign.linear_terms import with_gap
-from bayesdist.app.kinds.fitted import converged_posterior
-from bayesdist.app.kinds.parts import read_tables
 from bayesdist.errors import InputError
 from bayesdist.infer import GaussianPriors
 from bayesdist.infer.exposures.shared_drift import drift_priors

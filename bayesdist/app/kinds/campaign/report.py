@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.app.config import CampaignConfig
 from bayesdist.app.kinds.campaign.inputs import Inputs
-from bayesdist.app.kinds.campaign.matched import CampaignMatched, affine_model_of
-from bayesdist.app.kinds.fit_data import FitData
+from bayesdist.app.kinds.campaign.matched import affine_model_of, is_mirrored
+from bayesdist.app.run import Run
 from bayesdist.app.store import as_json
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data.preparing import motion_error_line
-from bayesdist.diagnose.overlap import OverlapTest
 from bayesdist.diagnose.residuals.binned import binned_residuals
 from bayesdist.files.tables import read_ecsv
 from bayesdist.infer import GaussianPriors, LinearFit, Posterior, fit_linear
@@ -40,31 +38,28 @@ HELD_BY_PRIOR = 0.99  # ratio to the prior sigma above which the data determine 
 WIDEST_CELL = 8  # largest factor on the size of cells
 
 
-def report_fields(
-    run: RunDirectory, data: FitData, posterior: Posterior, overlap: OverlapTest | None
-) -> dict[str, Any]:
+def report_fields(run: Run) -> dict[str, Any]:
     """Fields of the content of the report: catalogue, tables and series, and the words."""
-    model, fitted = posterior.model, data.fitted
-    matched = cast(CampaignMatched, data.matched)
-    inputs = matched.inputs
-    matching = read_ecsv(run / "matching.ecsv")
+    inputs: Inputs = run.inputs
+    directory, posterior = run.directory, run.posterior
+    matching = read_ecsv(directory / "matching.ecsv")
     results = CampaignResults(
-        summary=dict(run.summary),
+        summary=dict(directory.summary),
         config=as_json(run.config.model_dump(exclude_none=True)),
-        filter=matched.filter,
+        filter=inputs.filter,
         matching=matching,
-        chips=tuple(model.chips),
-        unit=model.unit,
+        chips=tuple(posterior.model.chips),
+        unit=posterior.unit,
         catalog=_catalog_stars(inputs, matching),
-        centroids=fitted.errors.by_magnitude,
+        centroids=run.errors.by_magnitude,
         detections=_detections(inputs),
-        footprints=_footprints(posterior, inputs, matched.mirrored),
-        residuals=_residuals(data, inputs.config),
-        tables=fitted.tables.tables,
-        series=_series(run, fitted.linear.model, matching),
-        overlap=overlap,
+        footprints=_footprints(posterior, inputs, is_mirrored(run.match_facts)),
+        residuals=_residuals(run),
+        tables=run.tables.tables,
+        series=_series(directory, run.model, matching),
+        overlap=run.diagnostics.overlap,
     )
-    held = frozenset(held_parameters(fitted.linear, fitted.priors))
+    held = frozenset(held_parameters(run.fit, run.priors))
     return {"campaign": results, "held": held, "words": PAIRED}
 
 
@@ -157,18 +152,20 @@ def _footprints(posterior: Posterior, inputs: Inputs, mirrored: bool) -> Footpri
 
 
 @one_thread
-def _residuals(data: FitData, config: CampaignConfig) -> tuple[ChipResiduals, ...]:
+def _residuals(run: Run) -> tuple[ChipResiduals, ...]:
     """Residuals of each chip without and with the tables, along the detector axes."""
-    pairs, moved = data.matched.stars, data.stars
-    model = affine_model_of(config, pairs)
-    tables = data.fitted.tables.tables
-    errors, farthest = data.fitted.errors.by_magnitude, config.fit.clip_abs
+    inputs: Inputs = run.inputs
+    pairs, moved, tables = run.stars, run.matches, run.tables.tables
+    model = affine_model_of(inputs.config, pairs)
+    errors, farthest = run.errors.by_magnitude, inputs.config.fit.clip_abs
     plain = pairs if errors is None else pairs.with_errors(errors, in_quadrature=True)
     if any(table.filter for table in tables):  # the detector's tables are from another run
         detector = [table for table in tables if not table.filter]
         plain = corrected_matches(detector, plain)
     # stars that are on their chip with and without the tables
-    inside = data.fitted.inside(pairs)
+    inside = np.ones(len(pairs), bool)
+    if tables:
+        inside = inside_chips(corrected_matches(tables, pairs), run.model)
     common = inside & inside_chips(plain, model)
     pairs, plain, moved = (
         matches if rows.all() else matches.select(rows, reason="moved off the chip")

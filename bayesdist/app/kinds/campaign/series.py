@@ -8,11 +8,9 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.app.config import Config
 from bayesdist.app.kinds.campaign.parts import ExposuresAlone
-from bayesdist.app.kinds.fitted import Fitted
+from bayesdist.app.run import Run
 from bayesdist.app.store.output import write_table
-from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.errors import DegenerateError
 from bayesdist.infer.series import Series, SeriesPosterior, TrendModel, describe, fit_series
 
@@ -22,34 +20,34 @@ N_EPOCHS = 25  # epochs at which the drift is tabulated
 MIN_EXPOSURES = 8  # fewest exposures for a statement about time
 
 
-def write_series_tables(run: RunDirectory, fitted: Fitted, config: Config) -> None:
+def write_series_tables(run: Run) -> None:
     """Write series.ecsv and drift.ecsv, and the section 'time_dependence' of summary.json."""
-    series = fitted.part(ExposuresAlone).series
-    time, seed = fitted.linear.model.time, config.sampler.seed
+    series, directory = run.part(ExposuresAlone).series, run.directory
+    time, seed = run.model.time, run.config.sampler.seed
     if time is None or len(series.names) < MIN_EXPOSURES:
         return
     trend = TrendModel("lines" if time.breaks else "line", time.breaks, reference=time.epoch0)
     try:
         posterior = fit_series(series, trend, seed=seed)
     except DegenerateError as error:
-        if config.has_free_rates:
+        if run.config.has_free_rates:
             raise
         log.info("diagnose: no drift from these exposures alone: %s", error.cause)
         return
-    write_table(_exposures(series, posterior), run / "series.ecsv")
-    write_table(_predictions(posterior), run / "drift.ecsv")
+    write_table(_exposures(series, posterior), directory / "series.ecsv")
+    write_table(_predictions(posterior), directory / "drift.ecsv")
     outlying = [
         name for name, p in zip(series.names, posterior.outlier_probability, strict=True) if p > 0.5
     ]
     verdicts = [_verdict(series, k, time.breaks, seed) for k in range(len(series.coefficients))]
     scatter = posterior.scatter_sigma.mean(axis=0).tolist()
-    run.summarise(
+    directory.summarise(
         time_dependence={
             "converged": posterior.convergence.converged,
             "lines": _lines(posterior),
             "scatter": dict(zip(series.coefficients, scatter, strict=True)),
             "outlying_exposures": outlying,
-            "warnings": list(_disagreements(fitted.facts["exposures_outlying"], outlying)),
+            "warnings": list(_disagreements(run.fit_facts["exposures_outlying"], outlying)),
             "breaks": _changes(posterior),
             "verdicts": verdicts,
         }

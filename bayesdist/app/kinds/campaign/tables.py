@@ -8,11 +8,11 @@ from functools import partial
 
 import numpy as np
 
+from bayesdist.app.artefacts.parts import StoredLookupTables
 from bayesdist.app.config import Config
 from bayesdist.app.kinds.campaign.inputs import Inputs
-from bayesdist.app.kinds.campaign.matched import CampaignMatched
+from bayesdist.app.kinds.campaign.matched import affine_model_of
 from bayesdist.app.kinds.campaign.reference import held_tables
-from bayesdist.app.kinds.parts import StoredLookupTables
 from bayesdist.data.magnitude_errors import MagnitudeErrors
 from bayesdist.data.matches import Matches
 from bayesdist.diagnose.tables import BetweenNodes, measured_between
@@ -73,7 +73,7 @@ log = logging.getLogger("bayesdist")
 ROUGH_ITERATIONS = 1  # iterations of the tables that are used only to estimate star errors
 
 
-def fit_tables(matched: CampaignMatched) -> tuple[StoredLookupTables, TableFit | None]:
+def fit_tables(pairs: Matches, inputs: Inputs) -> tuple[StoredLookupTables, TableFit | None]:
     """Fit the configured look-up tables, and combine them with those held fixed.
 
     The tables of the detector are fitted unless they are taken from another run, in which case the
@@ -86,19 +86,20 @@ def fit_tables(matched: CampaignMatched) -> tuple[StoredLookupTables, TableFit |
     fit : TableFit or None
         None if no tables are fitted.
     """
-    config, model, filter = matched.inputs.config, matched.affine_model, matched.inputs.filter
+    config, filter = inputs.config, inputs.filter
+    model = affine_model_of(config, pairs)
     block, grid = config.tables, config.assess.grid
-    held = held_tables(block, config.chips(), matched.inputs.base)
+    held = held_tables(block, config.chips(), inputs.base)
     if block.method == "none":
         if not held:
             return StoredLookupTables(), None
-        placed = on_the_chips(corrected_matches(held, matched.stars), model)
-        fit, _, errors = scatter_by_magnitude(placed, model, matched.inputs)
-        pairs = matched.stars.with_errors(errors)
+        placed = on_the_chips(corrected_matches(held, pairs), model)
+        fit, _, errors = scatter_by_magnitude(placed, model, inputs)
+        pairs = pairs.with_errors(errors)
         between = measured_between(pairs, fit, held, filter=filter, fitted=False)
         of_nodes = _on_the_grid(held, fit, "", grid, partial(_held_variance, held))
         return _stored(held, of_nodes, between), None
-    pairs, rough = _with_errors(matched, held)
+    pairs, rough = _with_errors(pairs, inputs, held)
     table_fit = fit_with_tables(
         pairs,
         model,
@@ -137,7 +138,7 @@ def scatter_by_magnitude(
 
 
 def _with_errors(
-    matched: CampaignMatched, held: tuple[LookupTable, ...]
+    pairs: Matches, inputs: Inputs, held: tuple[LookupTable, ...]
 ) -> tuple[Matches, TableFit]:
     """Pairs with errors by magnitude that exclude the table pattern, and a rough fit of the tables.
 
@@ -146,8 +147,7 @@ def _with_errors(
     large.  The smoothness of the rough tables hardly matters, because it hardly affects the
     scatter.
     """
-    pairs, inputs, model = matched.stars, matched.inputs, matched.affine_model
-    block = inputs.config.tables
+    model, block = affine_model_of(inputs.config, pairs), inputs.config.tables
     _, rough_errors, _ = scatter_by_magnitude(pairs, model, inputs)
     rough = fit_with_tables(
         rough_errors,

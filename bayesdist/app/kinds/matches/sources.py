@@ -6,8 +6,9 @@ import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
+from bayesdist.app.artefacts.reader import RunInput
 from bayesdist.app.config import ChipBlock, Data, MatchesConfig
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data import Matches, input_files, open_matches, read_matches
@@ -91,19 +92,6 @@ def check_chips(chips: Sequence[Chip], numbers: Sequence[int]) -> None:
 
 Paths = str | Path | Sequence[str | Path]
 Template = tuple[int, dict[str, object]]
-
-
-class RunInput(Protocol):
-    """Matches of a run that may have to be written to disk before they can be used."""
-
-    def load(self) -> Matches:
-        """All matches that the configuration selects."""
-
-    def move_into_run(self) -> bool:
-        """Move the matches into the folder of the run, which has begun; True if any were moved."""
-
-    def close(self) -> None:
-        """Remove files that were not moved."""
 
 
 @dataclass(frozen=True)

@@ -3,22 +3,28 @@
 from __future__ import annotations
 
 import logging
-from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, cast
 
+from bayesdist.app.artefacts.errors import QUOTED, ErrorLaw
+from bayesdist.app.artefacts.holdout import set_aside
+from bayesdist.app.artefacts.reader import StarReader
+from bayesdist.app.artefacts.stored_fit import (
+    FIT,
+    converged_posterior,
+    hierarchy_of,
+    read_stored_fit,
+)
 from bayesdist.app.config import Config, MatchesConfig
 from bayesdist.app.config.run import POSTERIOR, calibration_file
-from bayesdist.app.kinds.errors import QUOTED, ErrorLaw
-from bayesdist.app.kinds.fit_data import StarReader
-from bayesdist.app.kinds.fitted import FIT, Fitted, converged_posterior, load_fitted
-from bayesdist.app.kinds.matched import Matched, set_aside
 from bayesdist.app.kinds.matches.added_errors import compared_errors, in_circle
 from bayesdist.app.kinds.matches.plausibility import (
     refuse_empty_segments,
     refuse_stars,
 )
 from bayesdist.app.kinds.matches.sources import check_chips, read_configured
+from bayesdist.app.run import Run
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.tables.result_files import load_diagnostics
 from bayesdist.assess.model import with_diagnosed_errors
@@ -46,8 +52,10 @@ from bayesdist.products.registry import read_calibration
 log = logging.getLogger("bayesdist")
 
 
-def match_stars(stars: Matches, config: MatchesConfig) -> Matched:
+def match_stars(run: Run) -> Run:
     """Divide matched stars into fitted and held-out stars, as configured."""
+    config = cast(MatchesConfig, run.config)
+    stars: Matches = run.inputs
     files = ", ".join(stars.sources)
     if config.data.sigma == "by_magnitude":
         # These errors are estimated from residuals that the match circle has truncated, so that
@@ -60,7 +68,8 @@ def match_stars(stars: Matches, config: MatchesConfig) -> Matched:
             cause, _, do = fault.partition("; ")
             raise ConfigError(cause, where=files, do=do)
     config.mixture(stars.match_radius)  # uniform outliers need a radius
-    return Matched(*set_aside(config, stars))
+    fitted, held, exposures = set_aside(config, stars)
+    return run.having(stars=fitted, held_stars=held, held_exposures=exposures)
 
 
 def read_stars(config: MatchesConfig, base: Path) -> Matches:
@@ -88,51 +97,47 @@ def model_of(stars: Matches, config: Config) -> DistortionModel:
     )
 
 
-def fit_stars(
-    matched: Matched,
-    config: MatchesConfig,
-    base: Path = Path(),
-    reader: StarReader | None = None,
-) -> Fitted:
+def fit_stars(run: Run) -> Run:
     """Fit matched stars by least squares, with errors adjusted to the residuals.
 
-    After the fit `reader` holds the stars for later passes.  If the fit is degenerate or does not
-    settle, the error names the frames of the exposures that would help, if any.
+    After the fit the reader of the run holds the stars for later passes.  If the fit is degenerate
+    or does not settle, the error names the frames of the exposures that would help, if any.
     """
-    if reader is None:
-        with closing(StarReader(config.resources())) as opened:
-            return fit_stars(matched, config, base, reader=opened)
-    model = model_of(matched.stars, config)
-    refuse_stars(reader.sample(matched.stars), model, config)
-    if matched.stars.in_memory and matched.stars.epoch is not None:
+    config, stars = cast(MatchesConfig, run.config), run.stars
+    model = model_of(stars, config)
+    refuse_stars(run.reader.sample(stars), model, config)
+    if stars.in_memory and stars.epoch is not None:
         # only for all stars: a sample may have none in a short segment
-        refuse_empty_segments(matched.stars.epoch, model.time)
-    earlier = earlier_calibration(model, config, base)
+        refuse_empty_segments(stars.epoch, model.time)
+    earlier = earlier_calibration(model, config, run.base)
     try:
-        fitted = _fitted(matched.stars, model, config, reader, earlier)
+        fitted = _fitted(run, model, config, earlier)
     except (DegenerateError, NotSettledError) as error:
-        better = frames_that_help(matched.stars.sample(SAMPLE), model)
+        better = frames_that_help(stars.sample(SAMPLE), model)
         if better is None:
             raise
         raise type(error)(error.cause, where=error.where, do=better.sentence) from error
     refuse_geometry(
-        geometries(fitted.linear),
+        geometries(fitted["fit"]),
         scale_mas=config.detector.scale_mas,
-        tangent_point=matched.stars.tangent_point,
-        where=", ".join(matched.stars.sources),
+        tangent_point=stars.tangent_point,
+        where=", ".join(stars.sources),
     )
-    linear = replace(fitted.linear, tangent_point=matched.stars.tangent_point)
-    return replace(fitted, linear=linear)
+    fit = replace(fitted["fit"], tangent_point=stars.tangent_point)
+    return run.having(**{**fitted, "fit": fit})
 
 
 def _fitted(
-    stars: Matches,
+    run: Run,
     model: DistortionModel,
     config: MatchesConfig,
-    reader: StarReader,
     earlier: CalibrationPrior | None,
-) -> Fitted:
-    """Fit with errors by magnitude, or with the quoted errors adjusted to the residuals."""
+) -> dict[str, Any]:
+    """Fit with errors by magnitude, or with the quoted errors adjusted to the residuals.
+
+    The result has the artefacts of the stage 'fit' by their names.
+    """
+    stars, reader = run.stars, run.reader
     priors = priors_of(model, config)
     rejection = Rejection(config.fit.clip_chi2, config.fit.clip_abs, config.fit.radial_weight)
     by_magnitude = config.data.sigma == "by_magnitude"
@@ -163,7 +168,7 @@ def _fitted(
 
     linear, errors = begun(priors)
     if by_magnitude:
-        return Fitted(linear, errors, priors)
+        return {"fit": linear, "errors": errors, "priors": priors}
     factor = error_scale(linear, reader.sample(stars, errors))
     if factor != 1.0:
         errors = ErrorLaw(factor)
@@ -172,7 +177,7 @@ def _fitted(
     if grouped is not None and grouped.added is not None:
         errors = ErrorLaw(factor, added=grouped.added)
         linear = fitted(errors)
-    return Fitted(linear, errors, priors, grouped)
+    return {"fit": linear, "errors": errors, "priors": priors, "added_errors": grouped}
 
 
 def shards_of(
@@ -221,5 +226,6 @@ def _calibration(path: Path, filter: str | None) -> Calibration:
         run.require("prior_calibration", ("fit", "sample", "diagnose"))
         fit = load_fit(folder / FIT)
         diagnostics = load_diagnostics(run, fit, posterior)
-        posterior = with_diagnosed_errors(posterior, diagnostics, load_fitted(folder).hierarchy)
+        hierarchy = hierarchy_of(fit, read_stored_fit(folder)["parts"])
+        posterior = with_diagnosed_errors(posterior, diagnostics, hierarchy)
     return calibration_of(posterior, str(folder))

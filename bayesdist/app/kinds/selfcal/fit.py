@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.app.config import Config
-from bayesdist.app.kinds.errors import ErrorLaw
-from bayesdist.app.kinds.fit_data import FitData
-from bayesdist.app.kinds.fitted import FIT_AGAIN, Fitted, load_fitted
+from bayesdist.app.artefacts.errors import ErrorLaw
+from bayesdist.app.artefacts.stored_fit import FIT_AGAIN, read_stored_fit
 from bayesdist.app.kinds.selfcal.gauge import fixed_by, gauge_summary, gauge_table, gauge_words
-from bayesdist.app.kinds.selfcal.matched import SelfcalMatched, magnitude_errors_of, matches_of
+from bayesdist.app.kinds.selfcal.inputs import Inputs
+from bayesdist.app.kinds.selfcal.matched import (
+    FirstSolution,
+    magnitude_errors_of,
+    matches_of,
+    unused_detections,
+)
 from bayesdist.app.kinds.selfcal.solved import SOLUTION, SelfCalibrated
+from bayesdist.app.run import Run
 from bayesdist.files.hdf5 import read_arrays
 from bayesdist.infer import Compute, GaussianPriors, Posterior
 from bayesdist.infer.selfcal import SelfCalibrationMode, sample_selfcal
@@ -45,18 +49,18 @@ def arrays_of(solution: SelfCalibrationMode, reference: Float) -> dict[str, NDAr
     }
 
 
-def load_selfcal(folder: Path, matched: Callable[[], SelfcalMatched]) -> Fitted:
-    """Load the fit of an earlier stage, including its solution."""
-    fitted = load_fitted(folder)
-    matches = matched()
-    compute = matches.inputs.config.resources()
-    arrays = read_arrays(folder / SOLUTION, "", "a solution of detections", ARRAYS, do=FIT_AGAIN)
-    solved = solved_of(matches, fitted.linear.model, arrays, compute)
-    return replace(fitted, parts={"solved": solved})
+def load_selfcal(run: Run) -> Run:
+    """Run with the fit of an earlier stage, including its solution."""
+    folder = run.directory.path
+    artefacts = read_stored_fit(folder)
+    path = folder / SOLUTION
+    arrays = read_arrays(path, "", "a solution of detections", ARRAYS, do=FIT_AGAIN)
+    solved = solved_of(run, artefacts["fit"].model, arrays, run.config.resources())
+    return run.having(**{**artefacts, "parts": {"solved": solved}})
 
 
 def solved_of(
-    matched: SelfcalMatched,
+    run: Run,
     model: DistortionModel,
     arrays: Mapping[str, NDArray[Any]],
     compute: Compute | None,
@@ -65,12 +69,13 @@ def solved_of(
 
     The fit itself uses the restored solution, so that later stages obtain the same one.
     """
-    inputs, held = matched.inputs, arrays["held"].astype(np.int64)
+    inputs: Inputs = run.inputs
+    first, held = run.part(FirstSolution), arrays["held"].astype(np.int64)
     theta, stars = arrays["theta"], arrays["stars"]
     jitter, fraction = (float(v) for v in arrays["mixture"])
     n_null, n_open = (int(n) for n in arrays["n_free"])
     mixture, constraints = Mixture(jitter, fraction), inputs.known_for(model)
-    problem = inputs.problem(model, matched.detections, theta, matched.theta)
+    problem = inputs.problem(model, first.detections, theta, first.theta)
     for _ in range(RELINEARISED):
         problem = problem.at(theta, stars)
     solution = mode_at(
@@ -85,14 +90,14 @@ def solved_of(
     )
     gauge = gauge_of(problem, theta, constraints(theta), solution)
     fixed, places = fixed_by(gauge, solution, constraints), solution.stars
-    contact = inputs.contact(model, matched.theta)
+    contact = inputs.contact(model, first.theta)
     return SelfCalibrated(
         solution,
         gauge,
         fixed,
         gauge_words(gauge, fixed, model, contact),
         gauge_table(gauge, fixed, model),
-        matches_of(problem, places, matched.detections, inputs, matched.unused),
+        matches_of(problem, places, first.detections, inputs, unused_detections(run.match_facts)),
         arrays,
         tuple(constraints.contradictions(theta)),
         inputs.catalog,
@@ -100,43 +105,44 @@ def solved_of(
     )
 
 
-def fit_selfcal(matched: SelfcalMatched) -> Fitted:
+def fit_selfcal(run: Run) -> Run:
     """Find mode and gauge of a self-calibration together."""
-    inputs, model = matched.inputs, matched.problem.model
+    inputs: Inputs = run.inputs
+    first = run.part(FirstSolution)
+    model = first.problem.model
     with one_cluster(inputs.config.resources()) as compute:
         mode = solve_in_gauge(
-            matched.problem,
-            matched.theta,
+            first.problem,
+            first.theta,
             inputs.known_for(model),
-            stars=matched.places,
-            mixture=matched.mixture,
+            stars=first.places,
+            mixture=first.mixture,
             jitter=inputs.jitter,
             compute=compute,
         )
-        solved = solved_of(matched, model, arrays_of(mode, matched.theta), compute)
+        solved = solved_of(run, model, arrays_of(mode, first.theta), compute)
     summary = gauge_summary(solved.gauge, solved.fixed, model)
-    return Fitted(
-        mode.solution,
-        ErrorLaw(by_magnitude=magnitude_errors_of(solved.mode, solved.matches)),
-        GaussianPriors.none(model),
+    return run.having(
+        fit=mode.solution,
+        errors=ErrorLaw(by_magnitude=magnitude_errors_of(solved.mode, solved.matches)),
+        priors=GaussianPriors.none(model),
         parts={"solved": solved},
-        facts={"selfcal": {**matched.facts, "gauge": summary}},
+        fit_facts={"selfcal": {**run.match_facts, "gauge": summary}},
     )
 
 
 def sample_detections(
-    data: FitData,
-    config: Config,
+    run: Run,
     *,
     folder: Path | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Posterior:
     """Sample the posterior of a self-calibration, with errors in the unit of u, v."""
     return sample_selfcal(
-        data.fitted.part(SelfCalibrated).mode,
-        outliers=config.mixture(),
-        **config.sampler.model_dump(),
+        run.part(SelfCalibrated).mode,
+        outliers=run.config.mixture(),
+        **run.config.sampler.model_dump(),
         folder=folder,
         progress=progress,
-        compute=config.resources(),
+        compute=run.config.resources(),
     )

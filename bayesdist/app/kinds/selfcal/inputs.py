@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from bayesdist.app.config import SelfcalConfig
-from bayesdist.app.kinds.matched import Outline
+from bayesdist.app.kinds.kind import Outline
 from bayesdist.app.kinds.selfcal.known import Commanded, GaugeConstraints, read_commanded
 from bayesdist.app.kinds.selfcal.start import started
 from bayesdist.app.kinds.star_lists import lists_of, refuse_other_chips

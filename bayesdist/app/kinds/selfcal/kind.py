@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from bayesdist.app.config import Config, SelfcalConfig
-from bayesdist.app.kinds.fit_data import FitData, StarReader
-from bayesdist.app.kinds.fitted import Fitted
-from bayesdist.app.kinds.kind import EvaluationDomain, Questions, RunKind
-from bayesdist.app.kinds.matched import Outline
+from bayesdist.app.config import SelfcalConfig
+from bayesdist.app.kinds.kind import EvaluationDomain, Outline, Questions, RunKind
 from bayesdist.app.kinds.selfcal.fit import fit_selfcal, load_selfcal, sample_detections
 from bayesdist.app.kinds.selfcal.inputs import (
     Inputs,
@@ -20,20 +17,22 @@ from bayesdist.app.kinds.selfcal.inputs import (
     read_selfcal,
     refuse_selfcal,
 )
-from bayesdist.app.kinds.selfcal.matched import SelfcalMatched, load_matched_selfcal
+from bayesdist.app.kinds.selfcal.matched import load_matched_selfcal
 from bayesdist.app.kinds.selfcal.matching import match_dithers, selfcal_lines
 from bayesdist.app.kinds.selfcal.solved import SelfCalibrated
+from bayesdist.app.run import Run
 from bayesdist.app.store.output import provenance_notes
-from bayesdist.app.store.rundir import RunDirectory
-from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.infer import Posterior
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.checks import Check
 
 
-class SelfcalKind(RunKind[SelfcalConfig, Inputs, SelfcalMatched]):
+class SelfcalKind(RunKind[SelfcalConfig, Inputs]):
     """Star lists of dithered exposures; the positions of the stars are fitted as well."""
 
+    section = "selfcal"
+    has_catalogue = False
+    along_detector = True
     rows = "detections"
     chooser = "limits of residuals"
     rehearses_fit = True
@@ -59,29 +58,29 @@ class SelfcalKind(RunKind[SelfcalConfig, Inputs, SelfcalMatched]):
         """Shape of the solution, from the initial model."""
         return outline_of_selfcal(inputs)
 
-    def match(self, inputs: Inputs, config: SelfcalConfig) -> SelfcalMatched:
-        """Detections of the same stars, and a first solution."""
-        return match_dithers(inputs)
+    def with_config(self, inputs: Inputs, config: SelfcalConfig) -> Inputs:
+        """Inputs for another configuration, which differs in the model only."""
+        return replace(inputs, config=config)
 
-    def load_matched(
-        self, folder: Path, inputs: Inputs, config: SelfcalConfig, summary: Mapping[str, Any]
-    ) -> SelfcalMatched:
-        """Detections of an earlier stage."""
-        return load_matched_selfcal(folder, inputs, summary)
+    def match(self, run: Run) -> Run:
+        """Run with the detections of the same stars, and a first solution."""
+        return match_dithers(run)
 
-    def fit(
-        self, matched: SelfcalMatched, config: SelfcalConfig, base: Path, reader: StarReader
-    ) -> Fitted:
-        """Mode and gauge."""
-        return fit_selfcal(matched)
+    def load_matched(self, run: Run) -> Run:
+        """Run with the detections of an earlier stage."""
+        return load_matched_selfcal(run)
 
-    def load_fitted(self, folder: Path, matched: Callable[[], SelfcalMatched]) -> Fitted:
-        """Fit of an earlier stage with its solution."""
-        return load_selfcal(folder, matched)
+    def fit(self, run: Run) -> Run:
+        """Run with mode and gauge."""
+        return fit_selfcal(run)
 
-    def fit_notes(self, data: FitData, config: SelfcalConfig) -> Iterator[tuple[int, str]]:
+    def load_fit(self, run: Run) -> Run:
+        """Run with the fit of an earlier stage and its solution."""
+        return load_selfcal(run)
+
+    def fit_notes(self, run: Run) -> Iterator[tuple[int, str]]:
         """Sentences about the gauge."""
-        gauge = data.fitted.part(SelfCalibrated).gauge
+        gauge = run.part(SelfCalibrated).gauge
         for text in gauge.settled:
             yield logging.INFO, text
         for text in gauge.unsettled:
@@ -89,54 +88,46 @@ class SelfcalKind(RunKind[SelfcalConfig, Inputs, SelfcalMatched]):
 
     def sample(
         self,
-        data: FitData,
-        config: Config,
+        run: Run,
         *,
         folder: Path | None = None,
         progress: Callable[[int, int], None] | None = None,
     ) -> Posterior:
         """Posterior of the parameters, with the stars eliminated."""
-        return sample_detections(data, config, folder=folder, progress=progress)
+        return sample_detections(run, folder=folder, progress=progress)
 
-    def questions(self, data: FitData, config: SelfcalConfig) -> Questions:
+    def questions(self, run: Run) -> Questions:
         """Residuals are smaller by the degrees of freedom of the stars."""
         return Questions(
-            centroid=data.fitted.errors.by_magnitude,
-            eliminated=data.fitted.part(SelfCalibrated).mode,
+            centroid=run.errors.by_magnitude,
+            eliminated=run.part(SelfCalibrated).mode,
         )
 
-    def save_diagnosed(
-        self,
-        run: RunDirectory,
-        data: FitData,
-        posterior: Posterior,
-        diagnostics: Diagnostics,
-        config: SelfcalConfig,
-    ) -> None:
+    def save_diagnosed(self, run: Run) -> None:
         """Write the catalogue of the stars."""
         from bayesdist.app.kinds.selfcal.stars import write_stars  # needed by one stage
 
-        solved = data.fitted.part(SelfCalibrated)
-        notes = provenance_notes(posterior, solved.gauge_words)
-        correlated, compute = diagnostics.correlated, config.resources()
-        stars = write_stars(run.path, solved, correlated, notes, compute)
-        run.summarise(selfcal=run.summary.get("selfcal", {}) | {"stars": stars})
+        solved, directory = run.part(SelfCalibrated), run.directory
+        notes = provenance_notes(run.posterior, solved.gauge_words)
+        correlated, compute = run.diagnostics.correlated, run.config.resources()
+        stars = write_stars(directory.path, solved, correlated, notes, compute)
+        directory.summarise(selfcal=directory.summary.get("selfcal", {}) | {"stars": stars})
 
-    def domain(self, data: FitData, config: Config) -> EvaluationDomain:
+    def domain(self, run: Run) -> EvaluationDomain:
         """As of matched stars; exposures overlap partly, which correlates frames with errors."""
-        return replace(super().domain(data, config), frames=True)
+        return replace(super().domain(run), frames=True)
 
-    def null_space(self, data: FitData) -> Float | None:
+    def null_space(self, run: Run) -> Float | None:
         """Directions that only the gauge fixes."""
-        return data.fitted.part(SelfCalibrated).gauge.null
+        return run.part(SelfCalibrated).gauge.null
 
-    def checks(self, data: FitData, series: Mapping[str, Any]) -> tuple[Check, ...]:
+    def checks(self, run: Run) -> tuple[Check, ...]:
         """Checks of degeneracies, constraints and detections."""
-        solved = data.fitted.part(SelfCalibrated)
+        solved = run.part(SelfCalibrated)
         named = {
             "Degeneracies": solved.gauge.sentences,
             "Constraints": solved.contradictions,
-            "Detections": data.matched.warnings,
+            "Detections": run.match_facts.get("warnings", ()),
         }
         # settled by the choice of a gauge, so that they are not a fault of the data
         settled = set(solved.gauge.settled)
@@ -146,18 +137,11 @@ class SelfcalKind(RunKind[SelfcalConfig, Inputs, SelfcalMatched]):
             for text in texts
         )
 
-    def report_parts(
-        self,
-        run: RunDirectory,
-        data: FitData,
-        posterior: Posterior,
-        diagnostics: Diagnostics,
-        epoch: float | None,
-    ) -> dict[str, Any]:
+    def report_parts(self, run: Run) -> dict[str, Any]:
         """Gauge and stars, and the words of a self-calibration."""
         from bayesdist.app.kinds.selfcal.report import report_fields  # needed by one stage
 
-        return report_fields(run, data.fitted, posterior, epoch)
+        return report_fields(run)
 
 
 SELFCAL = SelfcalKind()

@@ -9,15 +9,16 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.app.kinds.matched import Matched
+from bayesdist.app.artefacts.parts import Part
 from bayesdist.app.kinds.selfcal.inputs import Inputs
+from bayesdist.app.run import Run
 from bayesdist.data import MagnitudeErrors
 from bayesdist.data.detections import Detections
 from bayesdist.data.matches import Matches
@@ -108,28 +109,21 @@ ARRAYS = ("x", "y", "star", "sigma", "theta", "stars", "mixture", "model")
 
 
 @dataclass(frozen=True, eq=False)
-class SelfcalMatched(Matched):
-    """Detections matched with their stars by a first solution."""
+class FirstSolution(Part):
+    """Detections with their stars, and the first solution that matched them."""
 
-    section: ClassVar[str] = "selfcal"
-    has_catalogue: ClassVar[bool] = False
-    along_detector: ClassVar[bool] = True
+    title = "matched detections"
+    stage = "match"
 
-    inputs: Inputs = field(kw_only=True)
     # with star codes and errors, on a common tangent plane
-    detections: Detections = field(kw_only=True)
-    problem: Problem = field(kw_only=True)  # linearised at the first solution
-    theta: Float = field(kw_only=True)  # (D,), parameters of the first solution
-    places: Float = field(kw_only=True)  # (S, q), stars of the first solution
-    mixture: Mixture = field(kw_only=True)  # errors of the first solution
-
-    @property
-    def unused(self) -> dict[str, int]:
-        """Number of detections without a star, by reason."""
-        return dict(self.facts.get("detections", {}).get("unused", {}))
+    detections: Detections
+    problem: Problem  # linearised at this solution
+    theta: Float  # (D,), parameters
+    places: Float  # (S, q), stars
+    mixture: Mixture  # errors
 
     def save(self, folder: Path) -> None:
-        """Write the detections and the first solution to the folder of a run."""
+        """Write the detections and the solution to the folder of a run."""
         names, m = ("x", "y", "star", "sigma"), self.mixture
         arrays = {name: getattr(self.detections, name) for name in names}
         arrays |= {"theta": self.theta, "stars": self.places}
@@ -137,14 +131,21 @@ class SelfcalMatched(Matched):
         text = json.dumps(self.problem.model.to_dict())
         arrays["model"] = np.frombuffer(text.encode(), np.uint8)
         write_arrays(folder / DETECTIONS, "", arrays)
-        super().save(folder)
 
 
-def load_matched_selfcal(
-    folder: Path, inputs: Inputs, summary: Mapping[str, Any]
-) -> SelfcalMatched:
-    """Load the detections of an earlier stage from the folder of a run."""
-    path, content, do = folder / DETECTIONS, "a file of detections", "run the stage 'match' again"
+def unused_detections(facts: Mapping[str, Any]) -> dict[str, int]:
+    """Number of detections without a star, by reason.
+
+    `facts` is the section 'selfcal' of summary.json.
+    """
+    return dict(facts.get("detections", {}).get("unused", {}))
+
+
+def load_matched_selfcal(run: Run) -> Run:
+    """Run with the detections of an earlier stage, from its folder."""
+    inputs: Inputs = run.inputs
+    path, content = run.directory / DETECTIONS, "a file of detections"
+    do = "run the stage 'match' again"
     arrays = read_arrays(path, "", content, ARRAYS, do=do)
     with restoring(path, content, do=do):
         text = arrays["model"].astype(np.uint8).tobytes().decode()
@@ -158,33 +159,40 @@ def load_matched_selfcal(
         )
         mixture = Mixture(*(float(value) for value in arrays["mixture"]))
     first = arrays["theta"], arrays["stars"], mixture
-    return selfcal_matched(inputs, detections, model, first, facts=summary.get("selfcal", {}))
+    facts = run.directory.summary.get("selfcal", {})
+    return with_detections(run, detections, model, first, facts=facts)
 
 
-def selfcal_matched(
-    inputs: Inputs,
+def with_detections(
+    run: Run,
     detections: Detections,
     model: DistortionModel,
     first: tuple[Float, Float, Mixture],
     *,
     facts: Mapping[str, Any],
     table: Table | None = None,
-) -> SelfcalMatched:
-    """Detections with star codes and errors, matched with their stars by a first solution.
+) -> Run:
+    """Run with detections that are matched with their stars by a first solution.
 
-    `first` is that solution: parameters (D,), stars (S, q) and outlier mixture.
+    Parameters
+    ----------
+    run : Run
+    detections : Detections
+        With star codes and errors.
+    model : DistortionModel
+    first : tuple
+        First solution: parameters (D,), stars (S, q) and outlier mixture.
+    facts : mapping of str to object
+        Section 'selfcal' of summary.json.
+    table : Table, optional
+        One row per exposure.
     """
+    inputs: Inputs = run.inputs
     theta, places, mixture = first
     problem = inputs.problem(model, detections, theta, theta)
-    unused = facts.get("detections", {}).get("unused", {})
-    return SelfcalMatched(
-        matches_of(problem, places, detections, inputs, unused),
-        facts=facts,
-        table=table,
-        inputs=inputs,
-        detections=detections,
-        problem=problem,
-        theta=theta,
-        places=places,
-        mixture=mixture,
+    return run.having(
+        stars=matches_of(problem, places, detections, inputs, unused_detections(facts)),
+        match_facts=facts,
+        match_table=table,
+        match_parts={"first": FirstSolution(detections, problem, theta, places, mixture)},
     )

@@ -11,7 +11,8 @@ from astropy.table import Table
 
 from bayesdist.app.kinds.selfcal.gauge import CONVENTION, fixed_by
 from bayesdist.app.kinds.selfcal.inputs import Inputs
-from bayesdist.app.kinds.selfcal.matched import SelfcalMatched, selfcal_matched
+from bayesdist.app.kinds.selfcal.matched import with_detections
+from bayesdist.app.run import Run
 from bayesdist.app.screen import number
 from bayesdist.data.detections import NO_STAR
 from bayesdist.data.matching.pairs import hull_of, inside_hull
@@ -34,8 +35,9 @@ TURN_BACK = "turn its pixels back by 180 degrees if they were turned, or leave i
 AMBIGUOUS = 0.05  # fraction of ambiguous groups above which there is a warning
 
 
-def match_dithers(inputs: Inputs) -> SelfcalMatched:
+def match_dithers(run: Run) -> Run:
     """Match detections of dithered exposures to stars, with a first solution."""
+    inputs: Inputs = run.inputs
     calibration = calibrated(inputs, lambda text: log.info("match: %s", text))
     table, facts = exposure_table(calibration, inputs), matching_facts(calibration, inputs)
     refuse_unconnected(table)
@@ -53,8 +55,8 @@ def match_dithers(inputs: Inputs) -> SelfcalMatched:
     if inputs.tangent_plane is not None:
         moved = facts["tangent_planes_pix"]
         log.info("match: detections moved by up to %.2g pix onto one tangent plane", moved)
-    return selfcal_matched(
-        inputs,
+    return with_detections(
+        run,
         calibration.detections,
         s.problem.model,
         (s.theta, s.stars, s.mixture),

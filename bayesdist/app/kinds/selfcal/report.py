@@ -6,21 +6,17 @@ from typing import Any
 
 import numpy as np
 
-from bayesdist.app.kinds.fitted import Fitted
 from bayesdist.app.kinds.selfcal.solved import SelfCalibrated
-from bayesdist.app.store.rundir import RunDirectory
+from bayesdist.app.run import Run
 from bayesdist.files.tables import read_ecsv
-from bayesdist.infer import Posterior
 from bayesdist.model.grid import outline_pixels
 from bayesdist.report.context import DETECTED, SelfcalResults
 
 
-def report_fields(
-    run: RunDirectory, fitted: Fitted, posterior: Posterior, epoch: float | None
-) -> dict[str, Any]:
+def report_fields(run: Run) -> dict[str, Any]:
     """Fields of the content of the report: gauge and stars, and the words of the report."""
-    model, theta = fitted.linear.model, posterior.mean
-    solved = fitted.part(SelfCalibrated)
+    model, theta = run.model, run.posterior.mean
+    solved, directory, epoch = run.part(SelfCalibrated), run.directory, run.epoch
     outlines = []
     for e in range(len(model.exposures)):
         for chip in model.chips:
@@ -33,11 +29,11 @@ def report_fields(
     names = model.names
     results = SelfcalResults(
         words=solved.gauge_words,
-        gauge=read_ecsv(run / "gauge.ecsv"),
-        matching=read_ecsv(run / "matching.ecsv"),
-        stars=read_ecsv(run / "stars.ecsv"),
+        gauge=read_ecsv(directory / "gauge.ecsv"),
+        matching=read_ecsv(directory / "matching.ecsv"),
+        stars=read_ecsv(directory / "stars.ecsv"),
         outlines=tuple(outlines),
-        summary=run.summary["selfcal"],
+        summary=directory.summary["selfcal"],
     )
     held = frozenset(names[k] for k in solved.gauge.held)
     return {"selfcal": results, "held": held, "words": DETECTED}

@@ -10,7 +10,7 @@ from typing import Any
 from astropy.table import Table
 from numpy.typing import NDArray
 
-from bayesdist.app.kinds.parts import Part
+from bayesdist.app.artefacts.parts import Part
 from bayesdist.app.store.output import write_table
 from bayesdist.data import ReferenceCatalog
 from bayesdist.data.matches import Matches

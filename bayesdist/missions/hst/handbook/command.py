@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from astropy.table import Table
 
 from bayesdist.app.commands.on_files.calibrations import calibration_of_scale
-from bayesdist.app.results import open_results
+from bayesdist.app.run import Run
 from bayesdist.app.screen import table_text
 from bayesdist.app.store.output import record_folder, write_table
 from bayesdist.app.store.rundir import RunDirectory
@@ -90,9 +90,9 @@ def _residuals(path: Path) -> tuple[Mapping[int, BinnedResiduals], str]:
     if product or not (home / "run.json").exists():
         return {}, "; no residuals, since this is not a run"
     try:
-        with open_results(RunDirectory.open(home)) as results:
-            chips = results.fit.model.chips
-            sums = zip(chips, results.diagnostics.shown, strict=True)
+        with Run.of(RunDirectory.open(home)) as run:
+            chips = run.model.chips
+            sums = zip(chips, run.diagnostics.shown, strict=True)
             return {chip.number: chip_sums.residuals() for chip, chip_sums in sums}, ""
     except InputError as error:  # the matches were moved: everything else can be shown
         return {}, f"; no residuals: {error}"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack, closing
+from contextlib import ExitStack
 from pathlib import Path
 
 from bayesdist.app.screen import table_text
@@ -67,10 +67,10 @@ def bands_of_runs(
     with ExitStack() as stack:
         bands = open_bands(runs)
         for band in bands.values():
-            stack.enter_context(closing(band.results))
+            stack.enter_context(band.run)
         recording = record_folder(Path(output), "bands.json", command)
         folder, record = stack.enter_context(recording)
-        order = {str(band.results.run.path): name for name, band in bands.items()}
+        order = {str(band.run.directory.path): name for name, band in bands.items()}
         named = [order[str(Path(path))] for path in runs]
         inputs = measure_bands(
             bands,
@@ -86,13 +86,13 @@ def bands_of_runs(
 
 def _meta(bands: Mapping[str, BandRun], folder: Path) -> list[str]:
     """Write WISE meta-data if all bands are of WISE and in pixels; returns the file names."""
-    models = [band.results.posterior.model for band in bands.values()]
+    models = [band.run.posterior.model for band in bands.values()]
     if not set(bands) <= set(WISE_BANDS) or any(model.unit != "pix" for model in models):
         return []
     headers = {
         int(name[1:]): sip_from_solution(
-            band.results.solution,
-            epoch=band.results.epoch,
+            band.run.solution,
+            epoch=band.run.epoch,
             linear="sip",
             inverse_order=META_ORDER,
             scale_arcsec=band.arcsec,

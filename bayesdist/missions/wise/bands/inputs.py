@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from bayesdist.app.results import Results, results_of
+from bayesdist.app.run import Run
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess import pixel_scale_of
 from bayesdist.errors import InputError
@@ -26,18 +26,18 @@ class BandRun:
     """Finished run of a band."""
 
     name: str  # name of the detector
-    results: Results
+    run: Run
     arcsec: float  # arcsec per pixel
 
     @property
     def path(self) -> str:
         """Folder of the run."""
-        return str(self.results.run.path)
+        return str(self.run.directory.path)
 
     @property
     def chip(self) -> Chip:
         """Chip of the band."""
-        return self.results.posterior.model.chips[0]
+        return self.run.posterior.model.chips[0]
 
     @property
     def field_of_view(self) -> tuple[float, float]:
@@ -67,28 +67,28 @@ def open_bands(paths: Sequence[str | Path]) -> dict[str, BandRun]:
 
 
 def _opened(path: str | Path) -> BandRun:
-    run = RunDirectory.open(path)
+    directory = RunDirectory.open(path)
     for kind, word, do in _OTHER_KINDS:
-        if hasattr(run.config, kind):
+        if hasattr(directory.config, kind):
             raise InputError(f"is a run of a {word}", where=str(path), do=do)
-    results = results_of(run)
-    run.require("bands", ("fit", "sample", "diagnose"))
-    chips = results.posterior.model.chips
+    run = Run.of(directory)
+    directory.require("bands", ("fit", "sample", "diagnose"))
+    chips = run.posterior.model.chips
     if len(chips) > 1:
         raise InputError(
             f"has {len(chips)} chips, but bands must have one chip",
             where=str(path),
             do="give runs of one chip each",
         )
-    config = results.config
-    scale = pixel_scale_of(results.posterior, scale_mas=config.detector.scale_mas)
+    config = run.config
+    scale = pixel_scale_of(run.posterior, scale_mas=config.detector.scale_mas)
     if scale is None:
         raise InputError(
             "the pixel scale is unknown",
             where=f"{path}, detector.scale_mas",
             do="give it in the configuration and run again",
         )
-    return BandRun(config.detector.name or run.path.resolve().name, results, scale / 1000)
+    return BandRun(config.detector.name or directory.path.resolve().name, run, scale / 1000)
 
 
 def _require_one_field(bands: Mapping[str, BandRun]) -> None:

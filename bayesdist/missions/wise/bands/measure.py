@@ -40,11 +40,11 @@ def measure_bands(
     """Compute the content of all tables and figures; the stars of each band are read once."""
     wise = published and set(runs) <= set(WISE_BANDS)
     fields = {
-        name: field_of_solution(run.results.solution, epoch=run.results.epoch)
-        for name, run in runs.items()
+        name: field_of_solution(band.run.solution, epoch=band.run.epoch)
+        for name, band in runs.items()
     }
     bands = tuple(
-        _measured(run, fields[name], optical.get(name), bins, wise) for name, run in runs.items()
+        _measured(band, fields[name], optical.get(name), bins, wise) for name, band in runs.items()
     )
     arcsec = {b.name: b.arcsec for b in bands}
     tables = residual_tables(
@@ -88,36 +88,36 @@ def _times(field: DistortionField, factor: float, like: DistortionField) -> Dist
 
 
 def _measured(
-    run: BandRun, field: DistortionField, optical: OpticalModel | None, bins: int, wise: bool
+    band: BandRun, field: DistortionField, optical: OpticalModel | None, bins: int, wise: bool
 ) -> BandResult:
-    results, fit = run.results, run.results.fit
-    minus_optical = None if optical is None else field.minus(optical.field(run.chip, run.arcsec))
+    run, fit = band.run, band.run.fit
+    minus_optical = None if optical is None else field.minus(optical.field(band.chip, band.arcsec))
     vectors = field.vectors(GRID)
     without = {"no correction": field} | (
         {} if minus_optical is None else {"optical model": minus_optical}
     )
     rms = float(np.linalg.norm(field.to_pixels) * max(fit.rms_u, fit.rms_v) / np.sqrt(2))
-    sums = results.data.shards.sum(
+    sums = run.shards.sum(
         band_sums,
-        results.solution.mean,
+        run.solution.mean,
         fit.clip,
         field.to_pixels,
         without,
         1.25 * vectors.length_max + 4 * rms,
         bins,
     )
-    results.close()
-    order = results.posterior.model.order
+    run.close()
+    order = run.posterior.model.order
     binned, rng = sums.bins.residuals(), np.random.default_rng(SEED)
-    convergence = results.posterior.convergence
+    convergence = run.posterior.convergence
     return BandResult(
-        name=run.name,
-        path=run.path,
-        simulated=bool(results.run.facts["config"]["data"]["simulated"]),
+        name=band.name,
+        path=band.path,
+        simulated=bool(run.directory.facts["config"]["data"]["simulated"]),
         converged=convergence.converged,
         reasons=tuple(convergence.reasons),
-        arcsec=run.arcsec,
-        size=run.chip.size,
+        arcsec=band.arcsec,
+        size=band.chip.size,
         order=order,
         n_pairs=fit.n_rows,
         n_used=fit.n_used,
@@ -125,10 +125,10 @@ def _measured(
         partition=residual_partition(binned, order=order, rng=rng),
         correlation=residual_correlation(binned, order=order, rng=rng),
         vectors=vectors,
-        formal_map=uncertainty_map(fit, grid=GRID, epoch=results.epoch),
-        posterior_map=uncertainty_map(results.solution, grid=GRID, epoch=results.epoch),
+        formal_map=uncertainty_map(fit, grid=GRID, epoch=run.epoch),
+        posterior_map=uncertainty_map(run.solution, grid=GRID, epoch=run.epoch),
         minus_optical=None if minus_optical is None else minus_optical.vectors(GRID),
-        printed=_printed(run.name, field) if wise else None,
+        printed=_printed(band.name, field) if wise else None,
     )
 
 

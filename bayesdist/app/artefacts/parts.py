@@ -1,4 +1,4 @@
-"""Parts: results of a fit that only some kinds of runs have."""
+"""Parts: results of the matching or the fit that only some kinds of runs have."""
 
 from __future__ import annotations
 
@@ -18,12 +18,13 @@ TABLES = "tables.h5"
 
 
 class Part:
-    """Result of a fit that only some kinds of runs have.
+    """Result of the matching or the fit that only some kinds of runs have.
 
     Subclasses override what they contribute; the methods of this class contribute nothing.
     """
 
     title: ClassVar[str]  # what a run lacks without it, for errors
+    stage: ClassVar[str] = "fit"  # or "match": the stage that makes it
     recorded: ClassVar[bool] = False  # stored in fit.h5, as a dataclass, rather than by `save`
     is_hierarchy: ClassVar[bool] = False  # exposures scatter about the solution of the fit
     applies_errors: ClassVar[bool] = False  # stars from `placed` have their errors already
@@ -61,6 +62,9 @@ class StoredLookupTables(Part):
         if not self.tables or not stars.in_memory:
             return stars
         return on_the_chips(corrected_matches(self.tables, stars), model)
+
+
+NO_TABLES = StoredLookupTables()
 
 
 def write_tables(path: Path, stored: StoredLookupTables) -> None:

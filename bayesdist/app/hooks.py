@@ -1,0 +1,23 @@
+"""Functions that implement members of `Run` in modules that import `Run`.
+
+`Run` cannot import these modules.  Its members import the functions by name when they are called.
+"""
+
+SOURCE = "bayesdist.app.kinds.matches.sources:input_of_run"
+DIAGNOSE = "bayesdist.app.assessment.diagnosing:diagnostics_of_run"
+CHECKS = "bayesdist.app.assessment.checks:checks_of_run"
+ERROR_MODEL = "bayesdist.app.assessment.error_terms:error_model_of_run"
+SETTINGS = "bayesdist.app.assessment.error_terms:evaluation_settings"
+EVALUATE = "bayesdist.app.assessment.evaluating:evaluation_of_run"
+MARGINS = "bayesdist.app.assessment.evaluating:margins_of_run"
+DRAWN_ERRORS = "bayesdist.app.assessment.evaluating:drawn_errors_of_run"
+CALIBRATION = "bayesdist.app.questions:calibration_of_run"
+BUDGET = "bayesdist.app.questions:budget_of_run"
+MAP = "bayesdist.app.questions:map_of_run"
+PLOT = "bayesdist.app.questions:plots_of_run"
+WCS = "bayesdist.app.questions:wcs_of_run"
+TO_SKY = "bayesdist.app.questions:positions_on_sky"
+TEXT = "bayesdist.app.questions:text_of_run"
+HTML = "bayesdist.app.questions:html_of_run"
+REPORT = "bayesdist.app.report:write_html_report"
+SAVE = "bayesdist.app.run_folder:save_run"
