@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import astropy.units as u
@@ -241,7 +242,7 @@ def test_pixels_of_a_budget_may_have_their_unit(run):
 
 def test_draws_of_positions_have_the_errors_of_the_centroids(run):
     """Errors of 20 pixels, far above those of the calibration; the columns are photutils's."""
-    on_sky = bd.Run(run.results)
+    on_sky = replace(run)
     vars(on_sky)["calibration"] = camera()  # a cached property; that of `run` is in pixels
     stars = {"xcentroid": [100.0, 700.0], "ycentroid": [100.0, 500.0], "sx": [20.0, 20.0]}
     drawn = on_sky.to_sky(stars, centroids=("sx", "sx"), draws=2000)

@@ -10,7 +10,7 @@ from astropy.io import fits
 from astropy.table import Table
 from astropy.wcs import WCS
 
-from bayesdist.app.products.made_files import ProductInput, made_files
+from bayesdist.app.products.made_files import ProductInput, made_files, product_of_run
 from bayesdist.app.products.product_terms import _Laid, product_terms
 from bayesdist.app.run import Run
 from bayesdist.app.store.rundir import RunDirectory
@@ -106,7 +106,7 @@ def test_the_inverse_row_is_what_astropy_leaves(run):
 def test_forward_it_is_exact_at_its_own_date_and_lacks_the_drift_at_others(run, results):
     row = rows_of(run)["sip.hdr, forward"]
     assert row["radial"] < 1e-10
-    terms = product_terms(results.product, results.config, results.base)
+    terms = product_terms(product_of_run(results), results.config, results.base)
     [term] = [t for t in terms if t.row.name == "sip.hdr, forward"]
     x, y = np.array([1.0, 300.0, 512.0]), np.array([200.0, 7.0, 256.0])
     solution = results.solution

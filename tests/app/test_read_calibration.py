@@ -7,6 +7,7 @@ import pytest
 
 import bayesdist as bd
 from bayesdist import formats
+from bayesdist.app.products.made_files import product_of_run
 from bayesdist.app.run import Run
 from bayesdist.app.store.rundir import RunDirectory
 
@@ -17,7 +18,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::bayesdist.errors.BayesdistWarni
 
 def test_a_run_has_the_calibration_that_it_exports(finished):
     with Run.of(RunDirectory(finished.path)) as results:
-        exported = results.product.calibration
+        exported = product_of_run(results).calibration
     for path in (finished.path, finished.path / "posterior.nc"):
         found = bd.read_calibration(path)
         assert (found.unit, found.numbers, found.detector) == ("pix", (1,), "A")
