@@ -429,8 +429,8 @@ def test_runs_of_another_structure(change, words):
             config=SimpleNamespace(
                 detector=SimpleNamespace(scale_mas=scale), products=SimpleNamespace(release=1)
             ),
-            fitted=SimpleNamespace(tables=StoredLookupTables()),
-            run=SimpleNamespace(path=name),
+            tables=StoredLookupTables(),
+            directory=SimpleNamespace(path=name),
         )
 
     _require_alike({"F606W": run_of("a"), "F814W": run_of("b")})
