@@ -209,7 +209,10 @@ def frame_that_holds(
 
 
 def on_chip(chip: ChipMap, x: Float, y: Float) -> Bool:
-    """Boolean mask that is True for pixels on a chip, including its edges; False for NaN."""
+    """Boolean mask (N,) that is True for pixels on a chip, including its edges; False for NaN.
+
+    x and y (N,) are FITS 1-based.
+    """
     nx, ny = chip.basis.size
     return (x >= 0.5) & (x <= nx + 0.5) & (y >= 0.5) & (y <= ny + 0.5)
 
@@ -231,14 +234,14 @@ class Subarray:
             )
 
     def to_chip(self, x: ArrayLike, y: ArrayLike) -> tuple[Float, Float]:
-        """Convert pixels of the image to pixels of the chip, both FITS 1-based."""
+        """Convert pixels of the image to pixels of the chip, both FITS 1-based and of any shape."""
         return (
             (np.asarray(x, float) - self.ltv[0]) / self.ltm[0],
             (np.asarray(y, float) - self.ltv[1]) / self.ltm[1],
         )
 
     def from_chip(self, x: ArrayLike, y: ArrayLike) -> tuple[Float, Float]:
-        """Convert pixels of the chip to pixels of the image, both FITS 1-based."""
+        """Convert pixels of the chip to pixels of the image, both FITS 1-based and of any shape."""
         return (
             np.asarray(x, float) * self.ltm[0] + self.ltv[0],
             np.asarray(y, float) * self.ltm[1] + self.ltv[1],

@@ -293,7 +293,7 @@ class Calibration:
         return out
 
     def with_tables(self, maps: Mapping[int, ChipMap]) -> dict[int, ChipMap]:
-        """Maps of chips, by chip number, with the look-up tables of the calibration added."""
+        """Add the look-up tables of the calibration to maps of chips, given by chip number."""
         return {
             number: replace(
                 chip_map,

@@ -47,7 +47,7 @@ class Monomials:
         return self.basis.terms
 
     def index(self, i: int, j: int) -> int:
-        """Index of a term."""
+        """Index of the term with exponents i and j."""
         return self.terms.index((i, j))
 
     @property
@@ -238,7 +238,10 @@ class ChipMap:
         return Monomials(self.basis, values, cov)
 
     def padded(self, n_terms: int) -> tuple[Float, Float | None]:
-        """Coefficients (2, n) and covariance (2 n, 2 n), extended with zeros to n terms."""
+        """Coefficients (2, n) and covariance (2 n, 2 n), extended with zeros to `n_terms` terms.
+
+        The covariance is None if it is unknown.
+        """
         K = self.basis.n_terms
         coefficients = np.zeros((2, n_terms))
         coefficients[:, :K] = self.coefficients
@@ -489,7 +492,7 @@ class FurtherError:
 
 
 def scaled(rows: Sequence[FurtherError], factor: float) -> tuple[FurtherError, ...]:
-    """Errors with u and v multiplied by `factor`, to convert them to another unit."""
+    """Multiply u and v of errors by `factor`, to convert them to another unit."""
     return tuple(replace(row, u=factor * row.u, v=factor * row.v) for row in rows)
 
 

@@ -133,7 +133,8 @@ def fit_inverse(
     """Fit the inverse polynomials P and Q of a map from pixels (x, y) to (U, V).
 
     `forward` maps FITS 1-based pixels x, y (N,) to U, V (N,) in pixels.  `size` has the columns and
-    rows of the chip, and `order` is the total order of P and Q.
+    rows of the chip, and `order` is the total order of P and Q.  The pixel minus `reference_pixel`
+    (FITS 1-based) is U + P(U, V) and V + Q(U, V).
 
     The fit uses orthogonal polynomials over the bounding box of the mapped detector.  The grid
     consists of Chebyshev extrema, which are denser near the edges of the detector; this halves the
@@ -159,7 +160,10 @@ def fit_inverse(
 def detector_grid(
     size: tuple[float, float], nodes: int = CHECK_NODES, *, chebyshev: bool = False
 ) -> tuple[Float, Float]:
-    """Grid x, y (nodes^2,) between the centres of the corner pixels, uniform or Chebyshev."""
+    """Grid x, y (nodes^2,) between the centres of the corner pixels, FITS 1-based.
+
+    `size` has columns and rows.  The grid is uniform, or denser near the edges if `chebyshev`.
+    """
     t = np.linspace(-1.0, 1.0, nodes)
     if chebyshev:
         t = np.sin(t * np.pi / 2)

@@ -410,6 +410,8 @@ def turn_between(
 ) -> tuple[complex, bool]:
     """Scale and rotation from B to A as one complex number, and True if B is mirrored first.
 
+    `za` and `zb` are the coefficients (K,) of u + i v of both.
+
     Raises InputError, with the `name` of B, if B maps the chip to one point.
     """
     straight, flipped, norm = correlations(za, zb, basis)

@@ -19,7 +19,10 @@ ARCSEC = {"arcsec": 1.0, "mas": 1e-3, "deg": 3600.0}
 
 
 def arcsec_per(unit: str, scale_arcsec: float | None) -> float:
-    """Arcseconds per unit of u and v; pixels of unknown size are treated as arcseconds."""
+    """Arcseconds per unit of u and v; pixels of unknown size are treated as arcseconds.
+
+    `scale_arcsec` is the size of a pixel in arcsec, if it is known.
+    """
     return ARCSEC[unit] if unit != "pix" else (scale_arcsec or 1.0)
 
 
@@ -64,7 +67,7 @@ class Orientation:
 
     @property
     def sigma(self) -> dict[str, float]:
-        """Standard deviations of the four parameters, by name."""
+        """Standard deviations of shift_x, shift_y [arcsec], log_scale and angle [rad], by name."""
         deviations = np.sqrt(np.maximum(np.diag(self.cov), 0.0)).tolist()
         return dict(zip(PARAMETERS, deviations, strict=True))
 

@@ -179,7 +179,7 @@ class CalibrationWCS(BaseLowLevelWCS, HighLevelWCSMixin):
 
     @property
     def axis_correlation_matrix(self) -> Bool:
-        """Matrix that is True if a world axis depends on a pixel axis; here always."""
+        """Matrix (2, 2) that is True if a world axis depends on a pixel axis; here always."""
         return np.ones((2, 2), bool)
 
     @property

@@ -71,9 +71,10 @@ class Labels:
         return replace(self, n_rows=n, rejected={})
 
     def codes(self, key: str, block: Mapping[str, Any], *, source: str) -> Int:
-        """Codes of a block's exposures, chips or filters, converted to the labels of all files.
+        """Convert the codes of a block of rows to codes (n,) among the labels of all files.
 
-        Raises InputError for a label that did not exist when the files were scanned.
+        `key` is 'exposure', 'chip' or 'filter'.  Raises InputError for a label that did not exist
+        when the files were scanned.
         """
         code_by_label = self._numbers[key]
         labels = block[LABELS_OF_CODES[key]]
@@ -411,9 +412,10 @@ def joined_columns(parts: Sequence[Mapping[str, NDArray[Any]]]) -> dict[str, NDA
 def merged_codes(
     codes: Sequence[Int], labels: Sequence[tuple[Any, ...]], *, ordered: bool = False
 ) -> tuple[Int, tuple[Any, ...]]:
-    """Concatenate codes with different labels: returns the new codes and the labels.
+    """Concatenate codes with different labels; return the new codes (N,) and the labels.
 
-    Labels are in the order of their first appearance, or sorted if `ordered`.
+    There is one array of codes and one tuple of labels per table.  The returned labels are in the
+    order of their first appearance, or sorted if `ordered`.
     """
     all_labels: list[Any] = list(
         dict.fromkeys(label for part_labels in labels for label in part_labels)
@@ -448,9 +450,10 @@ def common_radius(radii: Sequence[float | None], sources: Sequence[str]) -> floa
 def merged_optional(
     name: str, arrays: Sequence[Float | None], sources: Sequence[str]
 ) -> Float | None:
-    """Concatenated column; None if no table has it.
+    """Concatenate a column (N,) of several tables; None if no table has it.
 
-    Raises InputError if only some tables have it; `sources` are the names of the tables.
+    `arrays` has an array, or None, for each table, and `sources` the names of the tables.  Raises
+    InputError if only some tables have the column.
     """
     present = [a for a in arrays if a is not None]
     if not present:

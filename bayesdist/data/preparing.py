@@ -270,7 +270,7 @@ def split_matches(matches: Matches, aside: HoldoutSpec) -> HoldoutSplit:
 
 
 def refuse_strangers(asked: Sequence[str], names: Sequence[str], where: str) -> None:
-    """Raise InputError for names of held-out exposures that are not among `names`."""
+    """Raise InputError if a name of a held-out exposure, in `asked`, is not among `names`."""
     for name in asked:
         if name not in names:
             raise InputError(

@@ -84,9 +84,9 @@ def position_codes(first: Float, second: Float) -> Int:
 def star_codes(first: Float, second: Float, same_position: str) -> tuple[Int | None, str]:
     """Codes (N,) of stars from their reference positions, and a note about them.
 
-    They are None and an empty note if no position occurs twice.  `same_position` is the option of
-    `ReadOptions`.  With 'separate_stars' each row gets a different code, so that equal positions
-    are not searched for again.
+    `first` and `second` (N,) are the coordinates.  If no position occurs twice, the codes are None
+    and the note is empty.  `same_position` is the option of `ReadOptions`.  With 'separate_stars'
+    each row gets a different code, so that equal positions are not searched for again.
     """
     code = position_codes(first, second)
     number = np.bincount(code)
@@ -252,7 +252,7 @@ def _bits(keys: Keys) -> list[UInt]:
 
 
 def row_hashes(keys: Keys) -> UInt:
-    """One integer hash per row."""
+    """Integer hash (N,) of each row; `keys` are the columns (N,)."""
     n = len(keys[0])
     out = np.zeros(n, np.uint64)
     for a in range(0, n, _BLOCK):
@@ -265,7 +265,10 @@ def row_hashes(keys: Keys) -> UInt:
 
 
 def first_duplicate(keys: Keys, *, hashing: Hashing = row_hashes) -> tuple[int, int] | None:
-    """Indices of a row and of its first repetition in all keys (N,); None if no row repeats."""
+    """Indices of a row and of its first repetition; None if no row repeats.
+
+    Rows are compared in all columns `keys` (N,), after a search by their hashes.
+    """
     return first_repetition(lambda: (keys,), 1, hashing=hashing)
 
 

@@ -107,11 +107,11 @@ def reference_sky(
 ) -> ReferenceSky:
     """Reference positions at `epoch`, with errors and motions if the table has them.
 
-    `epoch` (N,) is that of the exposures, `catalogue_epoch` that of the positions if there is no
-    such column. Besides ra and dec, these columns are used if they exist: sigma_ra, sigma_dec,
-    pm_ra, pm_dec and their errors, corr_ra and corr_dec (correlation of position and motion on one
-    axis), parallax and its error. Raises InputError for half a pair, and for missing or invalid
-    units.
+    `epoch` (N,) is the epoch of the exposures, and `catalogue_epoch` that of the reference
+    positions, used if the table has no such column; both are decimal years. Besides ra and dec,
+    these columns are used if they exist: sigma_ra, sigma_dec, pm_ra, pm_dec and their errors,
+    corr_ra and corr_dec (correlation of position and motion on one axis), parallax and its error.
+    Raises InputError for half a pair, and for missing or invalid units.
     """
     ra, dec = sky_columns(quantities)
     sigma = _pair(quantities, ("sigma_ra", "sigma_dec"), "arcsec")

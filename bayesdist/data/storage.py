@@ -335,7 +335,7 @@ def stored_file(
     *,
     exposure_name: str | None,
 ) -> StoredFile:
-    """Layout of a file from the names and units of its columns.
+    """Describe a stored file by the names and units of its columns.
 
     Raises InputError if a needed column is missing.  `exposure_name` is the name of the single
     exposure, if the file has no column of exposures.
@@ -536,7 +536,11 @@ def _parts(tables: Iterable[Matches], folder: Path) -> Iterator[Part]:
 def write_parts(
     folder: Path, parts: Iterable[Part], *, rows_per_group: int | None = None
 ) -> list[Path]:
-    """Write columns and units to part-00000.parquet and so on; remove all files if one fails."""
+    """Write parts to the files part-00000.parquet and so on in a folder; return their paths.
+
+    Each part has the columns, the units and the header of a file.  All files are removed if one
+    fails.
+    """
     written: list[Path] = []
     try:
         for columns, units, header in parts:
@@ -579,7 +583,8 @@ def write_columns(
     """Write a Parquet file atomically, with units in the metadata of its fields.
 
     `columns` are arrays (N,), or codes with their labels, which are stored as a dictionary.
-    `header` is stored as JSON in the metadata of the file.
+    `header` is stored as JSON in the metadata of the file.  `rows_per_group` is the number of rows
+    in a row group.
     """
     import pyarrow.parquet
 

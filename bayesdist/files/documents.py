@@ -101,7 +101,7 @@ def _not_too_deep(tree: Any, where: str, do: str) -> Any:
 
 
 def refuse_multiplied_yaml(text: str, budget: Budget) -> None:
-    """Refuse YAML that is nested too deeply or has aliases that expand to an implausible size.
+    """Raise FormatError for YAML that is nested too deeply or has aliases of implausible size.
 
     An alias counts with all nodes of its target, because programs that traverse the tree visit them
     each time. Raises FormatError also if the text is not YAML.

@@ -67,7 +67,7 @@ def _refuse_unfounded(raw: bytes, budget: Budget) -> None:
 
 
 def refuse_many_rows(header: fits.Header, budget: Budget) -> None:
-    """Refuse a table with too many rows, which may have a width of zero bytes."""
+    """Raise FormatError for a table with too many rows, which may have a width of zero bytes."""
     rows = header.get("NAXIS2", 0)
     if _is_table(header) and isinstance(rows, int):
         budget.refuse_rows(rows)
@@ -78,7 +78,7 @@ def _is_table(header: fits.Header) -> bool:
 
 
 def refuse_long_arrays(hdu: fits.BinTableHDU, budget: Budget) -> None:
-    """Refuse columns of variable-length arrays that together exceed the limits.
+    """Raise FormatError for columns of variable-length arrays that together exceed the limits.
 
     Each row points to its array in the heap, and all rows may point to the same one.
     """

@@ -204,7 +204,7 @@ def nested_texts(stored: pyarrow.parquet.ParquetFile) -> frozenset[str]:
 
 
 def refuse_long_text(column: pyarrow.ChunkedArray | pyarrow.Array, budget: Budget) -> None:
-    """Refuse a dictionary column with text that exceeds the limits as a numpy array.
+    """Raise FormatError for a dictionary column whose text exceeds the limits as a numpy array.
 
     A single long text in a dictionary may be used in every row without enlarging the file.
     """

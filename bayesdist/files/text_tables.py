@@ -93,7 +93,7 @@ def mark_of(rows: Sequence[str]) -> str | None:
 
 
 def refuse_numbers_as_names(cells: Sequence[str], *, where: str) -> None:
-    """Refuse a table without column names, which would use the first row of numbers as names.
+    """Raise FormatError for a table without column names, whose first row would be used as names.
 
     Some names may be numbers, such as those of filters, but fewer than half of them, and none has a
     decimal point.
@@ -154,7 +154,7 @@ def _pointed(line: str, mark: str | None) -> str:
 
 
 def refuse_multiplied_header(lines: Sequence[str], budget: Budget) -> None:
-    """Refuse an ECSV file with too many nodes in its header; see `refuse_multiplied_yaml`."""
+    """Raise FormatError for an ECSV header with too many nodes; see `refuse_multiplied_yaml`."""
     head = takewhile(lambda line: not line or line[0] == "#", map(str.strip, lines))
     text = "\n".join(re.sub(r"^# ?", "", line) for line in head)
     refuse_multiplied_yaml(text, budget)
@@ -241,11 +241,11 @@ def refuse_missing_cells(lines: Sequence[str], mark: str, *, where: str) -> None
 
 
 def refuse_cut_end(lines: Sequence[str], mark: str | None, *, where: str) -> None:
-    """Refuse a table with a truncated last number; warn if the last line has no line end.
+    """Raise FormatError if the last number of a table is truncated.
 
-    `lines` include line ends; `mark` separates cells, None for blanks. The last cell is compared
-    with those above it: it is truncated if it has fewer decimals although all others have the same
-    number, or less than half their length.
+    A warning is given if the last line has no line end. `lines` include line ends; `mark` separates
+    cells, None for blanks. The last cell is compared with those above it: it is truncated if it has
+    fewer decimals although all others have the same number, or less than half their length.
     """
     if not lines or lines[-1].endswith(("\n", "\r")):
         return

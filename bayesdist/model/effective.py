@@ -263,7 +263,7 @@ class Groups:
         return len(self.chip)
 
     def same(self, other: Groups) -> bool:
-        """True if two sets of groups are equal, apart from their members."""
+        """True if two sets of groups have equal chips, exposures and epochs."""
         return all(
             np.array_equal(getattr(self, name), getattr(other, name))
             for name in ("chip", "exposure", "epoch")

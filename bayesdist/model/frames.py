@@ -72,7 +72,10 @@ def _parts(kind: str, p: Float) -> tuple[Float, Float]:
 
 
 def frame_matrix(kind: str, p: ArrayLike) -> tuple[Float, Float]:
-    """Linear part M (..., 2, 2) and shift d (..., 2) of a frame with parameters (..., q)."""
+    """Linear part M (..., 2, 2) and shift d (..., 2) of frames with parameters `p` (..., q).
+
+    `kind` is the name of the frame model, such as 'shift_rotation'.
+    """
     p = np.asarray(p, float)
     rotation, symmetric = _parts(kind, p)
     return rotation @ symmetric, np.zeros((*p.shape[:-1], 2)) if kind == "none" else p[
@@ -81,7 +84,10 @@ def frame_matrix(kind: str, p: ArrayLike) -> tuple[Float, Float]:
 
 
 def frame_tangent(kind: str, p: ArrayLike) -> Float:
-    """Derivatives (..., q - 2, 2, 2) of M with respect to the parameters after the shifts."""
+    """Derivatives (..., q - 2, 2, 2) of M with respect to the parameters after the shifts.
+
+    M is the linear part of frames of a `kind` with parameters `p` (..., q).
+    """
     p = np.asarray(p, float)
     names = frame_names(kind)[2:]
     rotation, symmetric = _parts(kind, p)
@@ -96,7 +102,8 @@ def frame_tangent(kind: str, p: ArrayLike) -> Float:
 def rigid_part(kind: str, p: ArrayLike) -> tuple[Float, Float]:
     """Rotation R (..., 2, 2) in M, and its derivatives (..., q - 2, 2, 2).
 
-    The derivatives are with respect to the parameters after the shifts.
+    The frames have the parameters `p` (..., q); the derivatives are with respect to those after the
+    shifts.
     """
     p = np.asarray(p, float)
     names = frame_names(kind)[2:]
@@ -121,7 +128,10 @@ def chip_matrix(p: ArrayLike) -> tuple[Float, Float]:
 
 
 def nearest_frame(kind: str, M: ArrayLike, d: ArrayLike) -> Float:
-    """Parameters (q,) of the frame that is closest to a linear map in the Frobenius norm."""
+    """Parameters (q,) of the frame that is closest to the map M z + d, in the Frobenius norm.
+
+    M is a matrix (2, 2) and d a shift (2,).
+    """
     M = np.asarray(M, float)
     # M z = a z + b conj(z) with z = u + i v; a is the similarity nearest to M
     a = complex(M[0, 0] + M[1, 1], M[1, 0] - M[0, 1]) / 2

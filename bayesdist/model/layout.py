@@ -358,7 +358,7 @@ class ParameterLayout:
         return self.drift_slice(0 if chip is None else self.chip_code(chip))
 
     def drift_slice(self, chip_code: int) -> slice:
-        """Slice of theta with the time-dependent parameters of a chip code."""
+        """Slice of theta with the time-dependent parameters of a chip, given by its code."""
         start = self.n_polynomial + chip_code * self.n_tdd
         return slice(start, start + self.n_tdd)
 
@@ -393,9 +393,10 @@ class ParameterLayout:
         return self.n_frame > 0 and (exposure > 0 or (exposure == 0 and self.gauge == "held"))
 
     def own_slice(self, chip_code: int, exposure: int) -> slice:
-        """Slice within the `frame_slice` of an exposure with the deviations of a chip (by codes).
+        """Slice of the deviations of a chip within the `frame_slice` of an exposure.
 
-        The slice is empty if the chip has no deviations.
+        Chip and exposure are given by their codes.  The slice is empty if the chip has no
+        deviations.
         """
         if not (self.chip_deviations and chip_code > 0 and self.has_frame(exposure)):
             return slice(0, 0)

@@ -80,7 +80,7 @@ def dithered_model(
     """Model of dithered exposures, and its true parameters (D,).
 
     `coefficients` (chips, 2, K) are Legendre coefficients in pixels.  `offsets` and `rolls` are
-    those of `dither_pattern`.
+    those of `dither_pattern`, and `frames` is the frame model.
     """
     order = int((np.sqrt(8 * coefficients.shape[2] + 1) - 3) / 2)
     centre = coefficients[:, :, 0].mean(axis=0)
@@ -164,7 +164,8 @@ def pixels_of(
 ) -> tuple[Float, Float, Bool]:
     """Pixels x, y (S,) of stars on a chip, by Newton's method, and a mask (S,).
 
-    The mask is True for stars that fall on the chip; the pixels of all other stars are meaningless.
+    `sky` (S, 2) are positions u, v.  The mask is True for stars that fall on the chip; the pixels
+    of all other stars are meaningless.
     """
     basis = model.basis(chip.number)
     groups = model.groups(1, exposure=exposure, chip=chip.number)
@@ -216,7 +217,10 @@ class DitherPattern:
 
 
 def grid_offsets(n: tuple[int, int], step: tuple[float, float]) -> Float:
-    """Offsets (n_x n_y, 2) of a regular grid in pixels, row by row, starting at zero."""
+    """Offsets (n_x n_y, 2) of a regular grid in pixels, row by row, starting at zero.
+
+    `n` has the numbers of columns and rows, and `step` the distances in pixels along both axes.
+    """
     return np.stack(
         mesh(np.arange(n[0], dtype=float) * step[0], np.arange(n[1], dtype=float) * step[1]), axis=1
     )

@@ -104,5 +104,8 @@ def beta_std(a: float, b: float) -> float:
 
 
 def binom_ppf(p: ArrayLike, n: int, each: float) -> Int:
-    """Quantiles of the number of successes in n trials, each of success probability `each`."""
+    """Quantiles of the number of successes in n trials, at the probabilities `p` (any shape).
+
+    Each trial succeeds with probability `each`.
+    """
     return np.searchsorted(special.bdtr(np.arange(n + 1.0), n, each), p)

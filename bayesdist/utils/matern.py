@@ -19,16 +19,17 @@ Correlation = Sequence[tuple[float, float]]
 
 
 def matern(separation: Float) -> Float:
-    """Matern 3/2 correlation at a separation, given in units of the correlation length."""
+    """Matern 3/2 correlation at separations (any shape) in units of the correlation length."""
     z = np.sqrt(2 * SMOOTHNESS) * separation
     return np.asarray((1 + z) * np.exp(-z))
 
 
 def correlation_at(separation: Float, correlation: Correlation) -> Float:
-    """Correlation of a sum of fields at a separation, in the unit of the correlation lengths.
+    """Correlation at separations (any shape) of a sum of fields with the given lengths.
 
-    `correlation` has the fraction of the variance and the correlation length of each field.  If the
-    fractions add up to less than 1, the remaining variance is uncorrelated.
+    `correlation` has the fraction of the variance and the correlation length of each field; lengths
+    and separations have the same unit.  If the fractions add up to less than 1, the remaining
+    variance is uncorrelated.
     """
     out = np.zeros(np.shape(separation))
     for fraction, length in correlation:

@@ -64,7 +64,7 @@ def release_memory() -> None:
 
 
 def size_text(n_bytes: float) -> str:
-    """Number of bytes with a unit, such as '74 GB'."""
+    """Number of bytes as text with a decimal unit, such as '74 GB'."""
     units = ("bytes", "kB", "MB", "GB", "TB")
     power = min(len(units) - 1, int(math.log10(max(n_bytes, 1.0))) // 3)
     return f"{n_bytes / 1000**power:.3g} {units[power]}"

@@ -83,7 +83,10 @@ def rounded(value: Any, sigma: Any) -> str:
 
 
 def interval(low: Any, high: Any, sigma: Any) -> str:
-    """Interval with both ends rounded to the second significant digit of a standard deviation."""
+    """Text 'low to high', with both ends rounded to the second significant digit of `sigma`.
+
+    `MISSING` is returned if an end is not finite.
+    """
     if _finite(low) is None or _finite(high) is None:
         return MISSING
     return f"{rounded(low, sigma)} to {rounded(high, sigma)}"
@@ -96,7 +99,7 @@ def count(value: Any) -> str:
 
 
 def percent(value: Any, digits: int = 3) -> str:
-    """Fraction as a percentage; `MISSING` if the value is not finite."""
+    """Fraction as a percentage with `digits` significant digits; `MISSING` if it is not finite."""
     x = _finite(value)
     return MISSING if x is None else f"{number(100 * x, digits)}\u202f%"
 
@@ -110,7 +113,10 @@ def probability(p: Any) -> str:
 
 
 def p_words(p: float, digits: int = 1, least: float = 1e-300) -> str:
-    """p-value in ASCII, such as 'p = 0.02'; 'p < least' if it is below `least`."""
+    """p-value in ASCII, such as 'p = 0.02'; 'p < least' if it is below `least`.
+
+    `digits` is the number of significant digits.
+    """
     return f"p < {least:g}" if p < least else f"p = {p:.{digits}g}"
 
 
@@ -125,9 +131,9 @@ def broken_name(name: str) -> str:
 
 
 def counted(fraction: Any, error: Any, n: Any) -> str:
-    """Probability estimated from n draws, rounded to its error.
+    """Probability estimated from n draws, as text, rounded to its standard error.
 
-    If all or no draws are counted, the text is a bound such as '> 0.9993'.
+    If all or none of the draws are counted, the text is a bound such as '> 0.9993'.
     """
     p, draws = _finite(fraction), _finite(n)
     if p is None or draws is None or draws <= 0:
@@ -166,7 +172,7 @@ class Scale:
     unit: str
 
     def text(self, value: float, digits: int = 3) -> str:
-        """Convert a value from the native unit, and write it with this unit."""
+        """Text of a value, converted from the native unit to this one, with `digits` digits."""
         times = "\u202f×\u202f" if self.unit.startswith("10") else "\u202f"
         return f"{value * self.factor:.{digits}g}{times}{self.unit}".replace("-", "−")
 
@@ -252,7 +258,10 @@ def with_mas(
 
 
 def size_of(value: float, unit: str = "pix", digits: int = 3) -> str:
-    """Length in the display unit that avoids zeros; pixels are written as plain numbers."""
+    """Text of a length, in a unit in which it has no leading zeros; pixels stay plain numbers.
+
+    `unit` is that of `value`, and `digits` is the number of significant digits.
+    """
     if unit == "pix":
         return with_mas(value, unit, None, digits)
     return display_scale(unit, value).text(value, digits)

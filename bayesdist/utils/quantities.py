@@ -110,7 +110,10 @@ def values_in(values: Any, unit: str, what: str, *, where: str = "") -> Float:
 
 
 def scale_advice(given: str, unit: str, what: str) -> str:
-    """Advice for a value in pixels if an angle is required, or the reverse; otherwise empty."""
+    """Advice on converting `what`, if it has the unit `given` where `unit` is required.
+
+    The result is empty unless one of the units is the pixel and the other one is an angle.
+    """
     angles = ("arcsec", "mas", "deg")
     if given == "pix" and unit in angles:
         return f"multiply {what} by the size of a pixel in {unit}"

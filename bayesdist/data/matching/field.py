@@ -232,7 +232,10 @@ def friends_of_friends(
 
 
 def cells(places: Float, exposure: Int, length: float, detections: int) -> Iterator[Cell]:
-    """Sky cells with roughly `detections` detections each; empty cells are omitted."""
+    """Yield sky cells with roughly `detections` detections each; empty cells are omitted.
+
+    `places` are the positions (N, 2) and `length` is the match length, in the same unit.
+    """
     square = _squares(places, length)
     extent = square.max(axis=1) + 1.0
     side = int(np.sqrt(detections / len(places) * extent[0] * extent[1])) + 1

@@ -55,7 +55,10 @@ def hull_of(points: Float) -> tuple[Float, float]:
 
 
 def inside_hull(points: Float, equations: Float) -> Bool:
-    """Boolean mask (N,) that is True for points (N, 2) inside a hull, given by its half-planes."""
+    """Boolean mask (N,) that is True for points (N, 2) inside a hull.
+
+    A row (a, b, c) of `equations` (n, 3) states that a x + b y + c <= 0 inside.
+    """
     inside = np.ones(len(points), bool)
     for a, b, c in equations:
         inside &= points @ np.array([a, b]) + c <= 0
@@ -136,8 +139,9 @@ def chance_rate(points: Float, tree: cKDTree, radius: float | Float, step: float
 
 
 def are_enough(n: int, n_points: int, n_reference: int) -> bool:
-    """True if n pairs are convincing for `n_points` points and the reference stars among them.
+    """True if n pairs of stars are convincing.
 
+    `n_points` is the number of points, and `n_reference` that of the reference stars among them.
     At least `MIN_PAIRS` are needed, and either half of the smaller set or `CONVINCING_PAIRS`.
     """
     return n >= MIN_PAIRS and n >= min(CONVINCING_PAIRS, 0.5 * min(n_points, n_reference))
@@ -189,7 +193,10 @@ class LinearMap:
 
 
 def best_similarity(points: Float, reference: Float) -> LinearMap:
-    """Least-squares rotation, scale and shift from pairs (N, 2), about the mean of the points."""
+    """Least-squares rotation, scale and shift from `points` (N, 2) to `reference` (N, 2).
+
+    The map is about the mean of the points.
+    """
     origin, reference_mean = points.mean(axis=0), reference.mean(axis=0)
     p, q = (points - origin) @ [1, 1j], (reference - reference_mean) @ [1, 1j]
     turn = np.vdot(p, q) / np.vdot(p, p).real
@@ -245,8 +252,8 @@ def robust_fit(
 
     `fit` takes a mask (N,) of pairs and returns the solution and the distances (N,) of all pairs
     from it, or None if the pairs do not determine it.  The result is None in that case, and if
-    there are fewer than `least` pairs.  `slack` is the rounding error of a distance of zero; pairs
-    beyond `reach` are not used.
+    there are fewer than `least` pairs.  There are at most `rounds` fits.  `slack` is the rounding
+    error of a distance of zero; pairs beyond `reach` are not used.
     """
     robust, use = None, np.ones(n, bool)
     for _ in range(rounds):

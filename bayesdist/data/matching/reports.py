@@ -135,7 +135,10 @@ def check_campaign(
 
 
 def all_cut(stars: Detections, rejected: Mapping[str, int]) -> InputError:
-    """Error for a list without detections after the cuts, with the count of each cut."""
+    """Error for a list in which the cuts leave no detection.
+
+    `rejected` has the number of detections that each cut removed, by reason.
+    """
     counts = ", ".join(f"{count} {reason}" for reason, count in rejected.items())
     return InputError(
         f"the cuts leave none of {len(stars)} detections ({counts})",
@@ -145,7 +148,10 @@ def all_cut(stars: Detections, rejected: Mapping[str, int]) -> InputError:
 
 
 def too_many(failed: int, matched: int, n: int) -> bool:
-    """True if the number of failures shows that the campaign is misconfigured."""
+    """True if so many exposures failed that the campaign must be misconfigured.
+
+    `failed` and `matched` count the exposures so far, and n is the number of all exposures.
+    """
     return failed > _MAX_FRACTION_LEFT_OUT * n or (not matched and failed >= _MAX_FAILURES_AT_FIRST)
 
 
@@ -192,6 +198,8 @@ def match_warnings(
     reports: Sequence[ExposureReport], left_out: Mapping[str, str], log: ExposureLog
 ) -> list[str]:
     """Clauses on exposures that were left out, that lack a chip, or that are outliers.
+
+    `left_out` has the reason for each exposure that was left out, by name.
 
     An exposure is an outlier if its completeness is far below that of the others, if far more of
     its matches are expected to be false, or if its scale differs. The scale is corrected for

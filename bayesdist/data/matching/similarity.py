@@ -287,7 +287,10 @@ def _support(candidate: Candidate, stars: Complex, reference: PatternIndex) -> t
 
 
 def mismatch_reason(plane: Float, mag: Float | None, reference: PatternIndex) -> str:
-    """Clause on the scale or mirror image with which a list (N, 2) would match; empty if none."""
+    """Clause on the scale or mirror image with which a list does match; empty if there is none.
+
+    `plane` (N, 2) are the positions on the tangent plane, and `mag` (N,) the magnitudes, if known.
+    """
     ratios = [factor for unit_ratio in _RATIOS for factor in (unit_ratio, 1.0 / unit_ratio)]
     tries = [
         (1.0, _WIDE_SCALE, False),
@@ -343,9 +346,10 @@ class Triangles:
 
 
 def triangles_of(stars: Complex, anchors: Int, neighbours: int) -> Triangles:
-    """Triangles of each anchor with two of its nearest `neighbours`, for stars x + i y (N,).
+    """Triangles of stars x + i y (N,): each anchor with two of its nearest `neighbours`.
 
-    Each triangle occurs once. Nearly flat and nearly isosceles triangles are left out.
+    `anchors` are indices of stars.  Each triangle occurs once.  Nearly flat and nearly isosceles
+    triangles are left out.
     """
     points = np.stack([stars.real, stars.imag], axis=-1)
     neighbours = min(neighbours, len(stars) - 1)
@@ -408,10 +412,11 @@ class Candidate:
 def candidates(
     stars: Complex, level: StarTriangles, tolerance: float, scale: tuple[float, float]
 ) -> Iterator[Candidate]:
-    """Peaks of the votes from all pairs of triangles of equal shape, the best supported first.
+    """Yield peaks of the votes of all pairs of similar triangles, the best supported first.
 
     `stars` (N,) are positions x + i y from the middle of the list, brightest first if magnitudes
-    are known. `tolerance` applies to the logarithms of side ratios.
+    are known. `level` has the reference stars and their triangles. `tolerance` applies to the
+    logarithms of side ratios, and `scale` is the range of allowed scales.
     """
     # anchors are spread over the ranks, so that a clump of false bright detections does not
     # dominate

@@ -122,7 +122,7 @@ def needed_columns(
     source: str,
     read_sigma: bool = True,
 ) -> dict[str, str]:
-    """Column of each quantity as in `present_columns`.
+    """Names of the columns by quantity, as returned by `present_columns`.
 
     Raises InputError if a needed column is missing.
     """
@@ -200,9 +200,10 @@ def _refuse_unused(options: ReadOptions, found: Mapping[str, str], source: str) 
 
 
 def match_columns(quantities: Quantities, options: ReadOptions) -> dict[str, Any]:
-    """Arguments of `Matches` from the rows of a table with the columns found by `needed_columns`.
+    """Arguments of `Matches` from the rows of a table, by name.
 
-    Raises InputError if values are invalid, or if an option contradicts the columns.
+    The columns are those found by `needed_columns`.  Raises InputError if values are invalid, or if
+    an option contradicts the columns.
     """
     present, column = quantities.found, quantities.__getitem__
     out: dict[str, Any] = {}

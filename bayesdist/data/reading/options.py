@@ -210,7 +210,10 @@ def check_sigma(sigma: str | Number) -> None:
 def refuse_missing_errors(
     sigma: str | Number, has_sigma: bool, has_mag: bool, *, where: str
 ) -> None:
-    """Raise InputError if matches lack the columns that the option `sigma` requires."""
+    """Raise InputError if matches lack the columns that the option `sigma` requires.
+
+    `has_sigma` and `has_mag` state whether there are columns of errors and of magnitudes.
+    """
     if sigma == "columns" and not has_sigma:
         raise InputError(
             "holds no errors of the positions",

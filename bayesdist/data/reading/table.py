@@ -306,7 +306,10 @@ def match_arguments(
 
 
 def own_epoch(header: Mapping[str, Any]) -> float | str | None:
-    """Date of the exposure from its header: MJD-OBS as a decimal year, or DATE-OBS unchanged."""
+    """Date of the exposure from its header; None if the header has none.
+
+    MJD-OBS is converted to a decimal year; DATE-OBS is returned unchanged.
+    """
     upper = {str(key).upper(): value for key, value in header.items()}
     day = upper.get("MJD-OBS")
     if isinstance(day, int | float) and not isinstance(day, bool):

@@ -32,9 +32,10 @@ def row_number(index: int) -> str:
 def one_length(
     columns: Mapping[str, Any], *, integers: Collection[str] = (), where: str
 ) -> dict[str, NDArray[Any]]:
-    """Contiguous float64 arrays (int64 for `integers`) with the length of the first column.
+    """Convert columns to contiguous float64 arrays (N,), or int64 for those named in `integers`.
 
-    Arrays are converted to native byte order, which columns of FITS tables do not have.
+    Arrays are converted to native byte order, which columns of FITS tables do not have.  Raises
+    InputError if the columns have different lengths.
     """
     arrays = {
         name: np.ascontiguousarray(values, np.int64 if name in integers else np.float64)
@@ -139,7 +140,7 @@ def check_not_finite(value: str) -> None:
 
 
 def absent(column: Any, *, not_finite: bool) -> Bool:
-    """Boolean mask (N,) of rows without a value: masked or, if requested, not finite."""
+    """Boolean mask (N,) of rows without a value: masked or, with `not_finite`, NaN or infinite."""
     mask = np.array(np.broadcast_to(getattr(column, "mask", False), np.shape(column)), bool)
     if mask.ndim > 1:  # a column of arrays, which is rejected elsewhere
         return np.zeros(len(mask), bool)
@@ -154,8 +155,8 @@ def absent(column: Any, *, not_finite: bool) -> Bool:
 def zero_motions(first: Any, second: Any) -> Bool:
     """Boolean mask (N,) of stars with a proper motion of exactly 0 on both axes.
 
-    A measured motion is never exactly 0 on both axes; such rows come from tables in which missing
-    values were filled with 0.
+    The arguments are the columns of both components.  A measured motion is never exactly 0 on both
+    axes; such rows come from tables in which missing values were filled with 0.
     """
     zero = np.ones(len(first), bool)
     for column in (first, second):
@@ -190,9 +191,9 @@ def without_missing(
     spared: frozenset[str],
     motions: frozenset[str],
 ) -> tuple[Bool, dict[str, int]]:
-    """Boolean mask (N,) of rows with a value in every column that is read.
+    """Boolean mask (N,) of rows with a value in every column that is read, and counts by reason.
 
-    The other rows are counted by reason. With `reject`, values that are not finite count as
+    The counts are those of the other rows. With `reject`, values that are not finite count as
     missing. Missing values of `spared` quantities are allowed. For `motions`, NaN means that a star
     has no measured motion, as in catalogues; so do proper motions of exactly 0 on both axes, with a
     warning. Raises InputError if no row remains.

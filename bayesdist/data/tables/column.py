@@ -96,7 +96,7 @@ class SourceColumn:
         return 1.0 if column_unit is None else conversion(column_unit, unit, where=self.where)
 
     def fail(self, index: int, cause: str, do: str = "correct the row or drop it") -> InputError:
-        """Error about one value."""
+        """InputError about the value in row `index`, with its `cause` and what to `do` about it."""
         location = f"{self.source}, {self.place(index)}, column {self.name!r}"
         return InputError(cause, where=location, do=do)
 
