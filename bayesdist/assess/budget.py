@@ -65,7 +65,7 @@ class BudgetTerm:
         return np.hypot(self.u, self.v)
 
     def on(self, chip: int, rows: slice) -> BudgetTerm:
-        """The term on one chip, at a slice of its positions."""
+        """Part of the term on one chip, for the slice `rows` of its positions."""
         relative_error = self.by_chip.get(chip, self.relative_error)
         return replace(
             self, u=self.u[rows], v=self.v[rows], relative_error=relative_error, by_chip={}
@@ -424,7 +424,7 @@ def place_budget(
 
 
 def with_product(total: float, product: float) -> float:
-    """Rms of an error with zero mean plus a constant displacement.
+    """Rms of an error with zero mean and rms `total`, plus a constant displacement `product`.
 
     A constant is independent of any error, so the squares add up exactly.
     """

@@ -414,14 +414,20 @@ def field_statistic(name: str, error: Float) -> Float:
 
 
 def sizes(axis: str, error: Float) -> Float:
-    """Absolute errors (..., N) of an axis, or radial errors if `axis` is empty."""
+    """Absolute errors (..., N) of an axis, or radial errors if `axis` is empty.
+
+    `axis` is 'u', 'v' or empty, and `error` has shape (..., N, 2).
+    """
     if axis:
         return np.abs(error[..., "uv".index(axis)])
     return np.sqrt(error[..., 0] ** 2 + error[..., 1] ** 2)  # five times as fast as `hypot`
 
 
 def of_sizes(base: str, size: Float) -> Float:
-    """Statistic of sizes (..., N) over the last axis: 'max', 'mean', 'rms' or a percentile."""
+    """Statistic (...) of sizes (..., N) over the last axis.
+
+    `base` is 'max', 'mean', 'rms' or the name of a percentile.
+    """
     if base == "max":
         return size.max(axis=-1)
     if base == "mean":

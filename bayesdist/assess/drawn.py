@@ -39,9 +39,9 @@ MOST_PAIRS = 5000  # sampled pairs of positions, which give percentiles over all
 
 
 def generators(terms: Sequence[ErrorTerm], seed: int) -> list[np.random.Generator]:
-    """Random generator of each term, seeded with the name of its first row and its occurrence.
+    """Random generator of each term, seeded with `seed` and the name of its first row.
 
-    The draws of a term therefore do not depend on the other terms.
+    Terms of equal name are numbered. The draws of a term do not depend on the other terms.
     """
     occurrences: Counter[str] = Counter()
     out = []

@@ -92,7 +92,7 @@ class EvaluationSettings:
         return EvaluationDomain.of_chips(model, self.grid, epoch=self.epoch, region=self.field)
 
     def pixel_scale(self, errors: ErrorModel) -> float | None:
-        """Size of a pixel in mas: the stated one, or that of the solution."""
+        """Size of a pixel in mas: the stated one, or that of the solution; None if unknown."""
         return pixel_scale_of(errors.solution.solution, scale_mas=self.scale_mas)
 
 

@@ -131,7 +131,10 @@ class UncertaintyMap:
 
 
 def sigmas_of(uu: Float, vv: Float, uv: Float) -> tuple[Float, Float, Float]:
-    """Standard deviations (N,) of u and v, and their correlation; 0 if one is known exactly."""
+    """Standard deviations (N,) of u and v and their correlation, from variances and covariance.
+
+    `uu`, `vv` and `uv` have shape (N,).  The correlation is 0 if a position is known exactly.
+    """
     sigma_u, sigma_v = np.sqrt(uu), np.sqrt(vv)
     product = sigma_u * sigma_v
     correlation = np.divide(uv, product, out=np.zeros_like(uv), where=product > 0)
@@ -221,7 +224,7 @@ def uncertainty_map(
 def per_axis(sigma_u: ArrayLike, sigma_v: ArrayLike) -> Float:
     """Rms of the standard deviations of both axes, independent of their orientation.
 
-    `sigma_u`, `sigma_v`: in the same unit, which is also that of the result.
+    `sigma_u` and `sigma_v` have the same shape and unit, which are also those of the result.
     """
     return np.asarray(np.hypot(sigma_u, sigma_v) / np.sqrt(2.0))
 

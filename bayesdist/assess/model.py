@@ -126,7 +126,10 @@ class ErrorModel:
         return replace(self, terms=(*previous, *terms))
 
     def structure_sigma(self, domain: EvaluationDomain) -> Float | None:
-        """Standard deviations (N, 2) of structure that the model omits; None if there is none."""
+        """Standard deviations (N, 2) of structure that the model omits; None if there is none.
+
+        They are in the unit of u and v of the solution.
+        """
         for term in self.terms:
             if isinstance(term, StructureErrors) and term.left:
                 return term.sigma(domain)

@@ -267,9 +267,10 @@ def _pareto_smoothed(log_weights: Float, independent: float) -> tuple[Float, flo
 def rhat_and_bulk_draws(chains: Float, walkers: int = 1) -> Float:
     """Rank-normalised split R-hat and bulk effective sample size (2, D) of chains (C, N, D).
 
-    The N draws of a chain are ordered by step and, within a step, by walker.  R-hat uses this
-    order; it is the larger of the values for bulk and tails.  The effective sample size is that of
-    the mean of the normal scores, with the draws reordered walker by walker.
+    The N draws of a chain are ordered by step and, within a step, by walker; `walkers` is the
+    number of walkers.  R-hat uses this order; it is the larger of the values for bulk and tails.
+    The effective sample size is that of the mean of the normal scores, with the draws reordered
+    walker by walker.
     """
 
     def both(some: Float) -> Float:

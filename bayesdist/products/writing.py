@@ -133,7 +133,7 @@ def representable(
 
     Look-up tables that the format cannot hold are absorbed into a polynomial of order `order`, by
     default the highest order of the format. The polynomial of the calibration is converted to that
-    order as well.
+    order as well. Raises InputError if the format has no such order.
     """
     tables = bool(calibration.before or calibration.after)
     if order is None and (not tables or target.holds_tables):

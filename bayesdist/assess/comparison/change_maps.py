@@ -137,7 +137,10 @@ class Monitored:
 
 
 def is_late(change: Change, date: ChangeDate | None) -> bool:
-    """True if a change within the new matches is significant, and more so than the mean change."""
+    """True if a change within the new matches is significant, and more so than the mean change.
+
+    `date` is the most likely date of a change within the new matches, if it was searched for.
+    """
     if date is None or not np.isfinite(date.after):
         return False
     return date.p_value < min(DIFFERENCE.value / 2, change.test.p_value)

@@ -116,7 +116,7 @@ class Comparison:
 
     @property
     def sigma_of_largest(self) -> float | None:
-        """Standard error of the largest difference, along its direction."""
+        """Standard error of the largest difference, along its direction; None without errors."""
         if self.sigma_u is None or self.sigma_v is None or self.correlation is None:
             return None
         k = np.unravel_index(int(self.length.argmax()), self.length.shape)

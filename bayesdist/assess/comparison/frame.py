@@ -172,7 +172,10 @@ def draws_of_sum(parts: Iterable[tuple[float, ChipMap]]) -> float:
 
 
 def turn_matrix(turn: complex, *, mirrored: bool) -> Float:
-    """Matrix (2, 2) of a scale and rotation, applied after a reflection if mirrored."""
+    """Matrix (2, 2) of a scale and rotation, applied after a reflection if `mirrored`.
+
+    `turn` is the product of the scale and exp(i angle).
+    """
     matrix = np.array([[turn.real, -turn.imag], [turn.imag, turn.real]])
     return matrix * np.array([1.0, -1.0]) if mirrored else matrix
 
@@ -184,7 +187,11 @@ def least_squares(fields: Float, basis: PolynomialBasis) -> Float:
 
 
 def linear_part(basis: PolynomialBasis, coefficients: Float, a: ChipMap) -> Float:
-    """Derivatives (2, 2) of A's positions with respect to the pixel, at its reference pixel."""
+    """Derivatives (2, 2) of A's positions with respect to the pixel, at its reference pixel.
+
+    `coefficients` (2, K) are those of A for the `basis`.  Raises InputError if the matrix is
+    singular.
+    """
     linear = basis.to_monomials(coefficients)[:, 1:3]
     if abs(np.linalg.det(linear)) <= 1e-9 * np.abs(linear).max() ** 2:
         raise InputError("has a singular linear part", where=a.name, do="check its coefficients")

@@ -98,7 +98,11 @@ class PriorInformation:
     scale_sigma: float | None = None  # relative error of the pixel scale
 
     def prior(self, model: DistortionModel, theta: Float, pattern: DitherPattern) -> Prior:
-        """Prior that combines all of this knowledge, linearised at true parameters."""
+        """Prior (D parameters) that combines all of this knowledge.
+
+        It is linearised at the true parameters `theta` (D,), for the offsets and rolls of
+        `pattern`.
+        """
         out, n = Prior.none(theta), len(pattern)
         if self.offset_sigma is not None:
             # rolls are about the centre of all chips, so pixels elsewhere move with the roll
@@ -129,18 +133,22 @@ class PlannedPattern:
     maps: dict[str, tuple[UncertaintyMap, ...] | None]
 
     def per_axis(self, kind: str) -> Float:
-        """Standard deviations per axis at all grid points, pixels; infinite if unbounded."""
+        """Standard deviations per axis at all grid points of all chips in pixels, shape (N,).
+
+        `kind` is 'gauge-free', 'shape' or 'absolute'.  The result is [inf] if the errors are
+        unbounded.
+        """
         maps = self.maps[kind]
         if maps is None:
             return np.array([np.inf])
         return np.concatenate([m.per_axis.ravel() for m in maps])
 
     def rms(self, kind: str) -> float:
-        """Rms of the standard deviations per axis over the grid, pixels."""
+        """Rms of the standard deviations per axis over the grid, in pixels; see `per_axis`."""
         return float(np.sqrt(np.mean(self.per_axis(kind) ** 2)))
 
     def largest(self, kind: str) -> float:
-        """Largest standard deviation per axis on the grid, pixels."""
+        """Largest standard deviation per axis on the grid, in pixels; see `per_axis`."""
         return float(self.per_axis(kind).max())
 
     @property
@@ -332,7 +340,10 @@ def _without_rolls(found: PlannedPattern) -> str:
 
 
 def nearly_free(found: PlannedPattern) -> str:
-    """Nearly free combinations, described by their leading parameters; empty if there are none."""
+    """Sentence on nearly free combinations of parameters; empty if there are none.
+
+    The combinations are described by their leading parameters.
+    """
     weakest = found.solution.gauge.weakest
     if not len(weakest):
         return ""
@@ -486,8 +497,9 @@ def further_dithers(mode: SelfCalibrationMode, seed: int) -> list[FurtherDithers
     """Possible dither patterns of further exposures of a self-calibration.
 
     Offsets are drawn from the existing ones and smoothed without changing their variance; rolls are
-    the existing ones in random order. The list is empty if there are fewer than three exposures,
-    stars move or have prior positions, or the distortion depends on time.
+    the existing ones in random order, with random numbers from `seed`. The list is empty if there
+    are fewer than three exposures, stars move or have prior positions, or the distortion depends on
+    time.
     """
     problem = mode.problem
     model, E = problem.model, len(problem.model.exposures)

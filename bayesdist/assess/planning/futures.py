@@ -210,9 +210,9 @@ class Futures:
 
     @one_thread
     def met(self, schedule: Schedule, n: int, truths: Int) -> Bool:
-        """Boolean mask (t,) of the truths that lead to a met requirement with n more exposures.
+        """Boolean mask (t,) of truths that lead to a met requirement with n more exposures.
 
-        `truths`: numbers below `TRUTHS`, shape (t,).
+        `truths` (t,) are numbers below `TRUTHS`, and `schedule` has the dates of the exposures.
         """
         rho = n / self.data.n_exposures
         several = [self._of_solution(information) for information in schedule.of(n)]
@@ -493,9 +493,10 @@ class Schedule:
         return [further.information(n) for further in self.together] or [n * self.information]
 
     def deviations(self, n: int, n_existing: int) -> list[float]:
-        """Effect of the exposures' deviations on their mean, relative to the present one.
+        """Effect of the exposures' deviations on the solution, relative to their present effect.
 
-        The list has one value for each information in the result of `of`.
+        There are n more exposures, in addition to `n_existing`. The list has one value for each
+        information in the result of `of`.
         """
         independent = float(np.sqrt(n_existing / (n_existing + n)))
         return [further.deviations(n) for further in self.together] or [independent]

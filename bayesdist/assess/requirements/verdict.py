@@ -45,7 +45,10 @@ UNEXAMINED = Check(
 
 
 def counting_error(fraction: float, n: float) -> float:
-    """Standard deviation of a probability counted in n draws, with Jeffreys' prior; never zero."""
+    """Standard deviation of a probability counted in n draws, with Jeffreys' prior; never zero.
+
+    `fraction` is the fraction of draws that were counted.
+    """
     k = fraction * n
     return beta_std(k + 0.5, n - k + 0.5)
 
@@ -392,8 +395,8 @@ def time_checks(
 def visits_of(dates: Float, *, whole: Float | None = None) -> Float:
     """Start dates of the visits, ascending; consecutive exposures form one visit.
 
-    A visit spans at most one day or 2 % of the baseline. `whole`: dates that define the baseline;
-    `dates` by default.
+    `dates` has shape (E,) and is in decimal years. A visit spans at most one day or 2 % of the
+    baseline, defined by the dates `whole`; `dates` by default.
     """
     if not dates.size:
         return dates

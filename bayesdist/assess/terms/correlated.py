@@ -169,7 +169,7 @@ class FieldsOfExposures:
     def of_rows(self, rows: Int, rng: np.random.Generator) -> ErrorDraws:
         """Effect on the parameters, for the posterior draws with the given numbers, shape (n,).
 
-        With `single`, fields of single exposures are added, for the posterior draws in order.
+        With `self.single`, fields of single exposures are added, for the posterior draws in order.
         """
         discrepancy, n = self.discrepancy, len(rows)
         fields = required(discrepancy.fields, "no fields of exposures were estimated")
@@ -271,7 +271,11 @@ class LocalErrors:
         source: str = MEASURED,
         squares: Mapping[int, MeanSquare] | None = None,
     ) -> LocalErrors:
-        """Term from standard deviations (ny, nx, 2) on a grid of each chip, by chip number."""
+        """Term from standard deviations (ny, nx, 2) on a grid of each chip, by chip number.
+
+        `source` describes their origin, and `squares` are the measured mean squares by chip, if
+        known.
+        """
         sizes = {chip.number: chip.size for chip in model.chips}
         tables = {chip: table_of(chip, sizes[chip], np.asarray(s)) for chip, s in sigma.items()}
         return cls(name, tables, source, squares or {})

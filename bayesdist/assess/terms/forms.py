@@ -112,7 +112,7 @@ class VaryingTerm(ErrorTerm, Protocol):
 
     @property
     def varies(self) -> bool | None:
-        """True if the error may vary over the field."""
+        """True if the error may vary over the field; None is taken as False."""
         ...
 
     def treatments(
@@ -194,7 +194,11 @@ class ErrorField(ABC):
                 yield row, part, squares[row.name]
 
     def relative_error(self, chip: int, monte_carlo: float) -> float | None:
-        """Relative uncertainty of the size of a single row on a chip; None if it is unknown."""
+        """Relative uncertainty of the size of a single row on a chip; None if it is unknown.
+
+        `monte_carlo` is that of a standard deviation from the draws, because their number is
+        finite.
+        """
         return monte_carlo
 
 
@@ -363,7 +367,7 @@ class PolynomialField(DrawnField):
         return len(next(iter(self.coefficients.values())))
 
     def errors(self, draws: slice, scale: Scale) -> Float:
-        """Errors (d, N, 2) of the draws in a slice."""
+        """Errors (d, N, 2) of a slice of the draws; `scale` has factors for rows, by name."""
         size = scale.get(self.rows[0].name, 1.0) if self.rows else 1.0
         parts = []
         for chip, phi in self.domain.basis.items():
@@ -465,7 +469,7 @@ class FunctionField(DrawnField):
         return out
 
     def errors(self, draws: slice, scale: Scale) -> Float:
-        """Errors (d, N, 2) of the draws in a slice."""
+        """Errors (d, N, 2) of a slice of the draws; `scale` has factors for rows, by name."""
         parts = []
         for values, phi in self._parts:
             drawn = _of_draws(values, draws)
@@ -511,7 +515,7 @@ class FunctionField(DrawnField):
         return out
 
     def relative_error(self, chip: int, monte_carlo: float) -> float | None:
-        """Relative scatter of the rms of each draw over the chip; None for a stated size."""
+        """Relative scatter of the rms of each draw over the chip; None if the size is stated."""
         if self.of.covariance is not None:
             return None
         model = self.domain.model
@@ -560,7 +564,7 @@ class NoiseField(ErrorField):
     sigma: Float | None
 
     def squares(self) -> dict[str, Float]:
-        """Mean squares of the row, if any."""
+        """Mean squares (P, 2) of the row by its name; empty if there is no row."""
         return super().squares() if self.rows else {}
 
     def total(self) -> Float:
@@ -617,7 +621,7 @@ class KnownField(ErrorField):
         return {self.rows[0].name: moved**2}
 
     def total(self) -> Float:
-        """Zeros, because displacements are not errors."""
+        """Zeros (P, 2), because displacements are not errors."""
         return np.zeros_like(self.squares()[self.rows[0].name])
 
     def relative_error(self, chip: int, monte_carlo: float) -> float | None:
@@ -666,7 +670,11 @@ class TogetherField(DrawnField):
         *,
         remainder: bool = False,
     ) -> TogetherField:
-        """Field with the rows of all parts."""
+        """Field with the rows of all parts.
+
+        `whole` is the joint error, if it is not the sum of the rows, and `remainder` is explained
+        in `Together`.
+        """
         rows = tuple(row for part in parts for row in part.rows)
         return cls(rows, domain, parts, whole, remainder)
 
@@ -691,7 +699,7 @@ class TogetherField(DrawnField):
         return tuple(p for p in self.members if all(row.in_total for row in p.rows))
 
     def errors(self, draws: slice, scale: Scale) -> Float:
-        """Joint error (d, N, 2) of the draws in a slice, each row multiplied by its factor."""
+        """Joint errors (d, N, 2) of a slice of the draws; `scale` has factors for rows, by name."""
         if self.whole is None:
             out = reduce(np.add, (part.errors(draws, scale) for part in self._added))
         else:

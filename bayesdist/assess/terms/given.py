@@ -70,7 +70,7 @@ def names_catalogue(name: str) -> bool:
 
 
 def is_stated(sizes: Sequence[float | None], source: str) -> bool:
-    """True if a row states an error; a size of 0 counts only if its source is given."""
+    """True if a row states an error; a size of 0 counts only if `source` is not the default."""
     return any(sizes) or said_by_user(source) != GIVEN
 
 

@@ -161,7 +161,8 @@ def _of_exposures(model: DistortionModel, codes: Int) -> DistortionModel:
 def scan_dates(scores: tuple[PeriodScore, ...], change: Change) -> ChangeDate:
     """Find the most likely date of a change, its interval, and the scatter of the periods.
 
-    `change` provides the covariance of the release and the fields that frames absorb.
+    `scores` has the scores of the periods in chronological order.  `change` provides the covariance
+    of the release and the fields that frames absorb.
     """
     # Exclude the fields that frames absorb: they are not changes. Because of the drift between the
     # periods, N_b retains a small part of them.

@@ -267,7 +267,8 @@ class OrderSurfaces:
     def f_test(self, low: int, high: int) -> tuple[float, float]:
         """F statistic of both axes, and probability of a larger F if the lower order is adequate.
 
-        The noise is estimated from the residuals of the higher order.
+        `low` and `high` are the two orders.  The noise is estimated from the residuals of the
+        higher order.
         """
         a, b = self.orders.index(low), self.orders.index(high)
         chi2 = self.chi2.sum(axis=1)
@@ -286,7 +287,7 @@ class HeldOutOrders:
     log_density: Float
 
     def difference(self, low: int, high: int) -> tuple[float, float]:
-        """Log predictive density of a higher order minus that of a lower one, with its error.
+        """Log predictive density of order `high` minus that of order `low`, and its standard error.
 
         Both axes are summed.  The standard error is derived from the scatter between the groups.
         If the p additional coefficients of both axes deviate from zero by d standard errors in
@@ -542,15 +543,19 @@ def truncated(weight: Float, right: Float, about: Float, n_terms: int) -> Float:
 
 
 def departures(sums: FoldStatistics, about: Float, n_terms: list[int]) -> Float:
-    """Coefficients (orders, 2, K) of each order's fit to all folds, minus `about`."""
+    """Difference (orders, 2, K) between each order's fit to all folds and the coefficients `about`.
+
+    `about` has shape (2, K), and `n_terms` is the number of terms of each order.
+    """
     weight, right = sums.weight.sum(axis=0), sums.right.sum(axis=0)
     return np.stack([truncated(weight, right, about, k) for k in n_terms])
 
 
 def held_out_gain(sums: FoldStatistics, about: Float, n_terms: list[int]) -> Float:
-    """Log predictive density (F, orders, 2) of each fold for each order, fitted to all other folds.
+    """Log predictive density (F, orders, 2) of each fold in u and v, for each order.
 
-    It is minus half the chi-square of the fold in u and v, relative to that of the coefficients
+    The coefficients are fitted to all other folds; `n_terms` is the number of terms of each order.
+    The density is minus half the chi-square of the fold, relative to that of the coefficients
     `about` (2, K), and thus up to a constant common to all orders.  The uncertainty of the
     coefficients is not added to the errors.  For a small leverage h of the stars, this would change
     the expectation only to second order in h.

@@ -22,7 +22,7 @@ MOST_MJD = 2e6  # about five thousand years, close to the range of date librarie
 def mjd_periods(centres: Sequence[float], days: float) -> dict[str, tuple[float, float]]:
     """Start and end dates (decimal years) of periods of `days` days, by name.
 
-    Each period is centred on a Modified Julian Date and named after it.
+    Each period is centred on a Modified Julian Date, from `centres`, and named after it.
 
     Raises InputError if the length is not positive or a centre is not a valid date.
     """

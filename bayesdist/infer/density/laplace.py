@@ -56,7 +56,10 @@ class Conditional(Node):
 
 
 def starting_point(target: Target, fit: LinearFit) -> Float:
-    """Starting point psi (D,): theta of the linear fit; hyperparameters from its rejected stars."""
+    """Starting point psi (D,) of the search for the mode.
+
+    Theta is that of the linear fit; the hyperparameters are estimated from its rejected stars.
+    """
     scale = target.hyper.scale
     excess = max(fit.chi2 / max(fit.dof, 1) - 1.0, 0.0)
     f = np.clip(fit.n_rejected / fit.n_rows, 0.5 / fit.n_rows, 0.9)
@@ -129,8 +132,8 @@ def conditional_mode(
 def expected_mode(split: Split, node: Conditional, step: Float) -> Float:
     """Predicted mode (D',) at a grid point displaced by `step` (g,) from a node.
 
-    It is extrapolated along the tangent.  If this leaves the support (an outlier fraction below
-    zero or above one), the mode of the node is returned.
+    The mode of the node is extrapolated along its tangent.  If this leaves the support (an outlier
+    fraction below zero or above one), the mode of the node is returned.
     """
     y = node.mode + step @ node.tangent
     return y if split.contains(y) else node.mode

@@ -233,7 +233,7 @@ class Marginal:
         return cls(_with_tails(names[0], meshes[0], masses), second)
 
     def draw(self, p: Float) -> Float:
-        """Convert uniform random numbers (n, g) to draws (n, g) of the density."""
+        """Convert uniform random numbers `p` (n, g) to draws (n, g) of the density."""
         out = np.empty_like(p)
         if self.first is not None:
             out[:, 0] = self.first.quantile(p[:, 0])

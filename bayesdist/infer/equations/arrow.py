@@ -58,13 +58,13 @@ class Arrow:
         return np.concatenate([np.arange(self.n_global), tail]), local
 
     def split(self, vector: Float) -> tuple[Float, Float]:
-        """Border part (..., b) and local part (..., n_blocks, q) of vectors (..., size)."""
+        """Split vectors (..., size) into border part (..., b) and local part (..., n_blocks, q)."""
         border, local = self._indices
         n, q = self.blocks.shape[:2]
         return vector[..., border], vector[..., local].reshape(*vector.shape[:-1], n, q)
 
     def join(self, border_part: Float, local_part: Float) -> Float:
-        """Vectors (..., size) from border part and local part: the inverse of `split`."""
+        """Join a border part (..., b) and a local part (..., n_blocks, q): inverse of `split`."""
         border, local = self._indices
         out = np.empty((*border_part.shape[:-1], self.size))
         out[..., border] = border_part

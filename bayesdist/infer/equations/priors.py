@@ -149,7 +149,7 @@ class Prior:
 
     @classmethod
     def none(cls, reference: Float) -> Prior:
-        """Flat prior on D parameters."""
+        """Flat prior on the D parameters, expanded about `reference` (D,)."""
         D = len(reference)
         return cls(reference, np.zeros((D, D)), np.zeros(D))
 

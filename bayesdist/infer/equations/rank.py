@@ -137,7 +137,7 @@ def _reason(
 def check_coverage(
     model: DistortionModel, survey: Survey, n_priors: int = 0, *, known: bool = False
 ) -> None:
-    """Raise DegenerateError if the data cannot determine the model.
+    """Raise DegenerateError if the data, summarised by `survey`, cannot determine the model.
 
     This is the case if there are fewer measurements (including `n_priors` informative priors) than
     parameters, too few stars in an exposure, no stars on a chip, stars outside a chip or on a line,

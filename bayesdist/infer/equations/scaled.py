@@ -40,7 +40,7 @@ def unit_diagonal(matrix: Float) -> tuple[Float, Float]:
 
 
 def scaled_cholesky(cov: Float) -> Float:
-    """Lower Cholesky factor (n, n) of a covariance, with zero rows for zero variances."""
+    """Lower Cholesky factor (n, n) of a covariance (n, n), with zero rows for zero variances."""
     free = np.flatnonzero(np.diag(cov) > 0)
     inner = np.ix_(free, free)
     unit, scale = unit_diagonal(cov[inner])
@@ -79,7 +79,10 @@ class FieldTest(NamedTuple):
 
     @classmethod
     def of(cls, white: Float, *, shrink: float = 1.0) -> FieldTest:
-        """Test of whitened differences (dof,); the chi-square is multiplied by `shrink`."""
+        """Test of differences `white` (dof,) that were divided by their errors (whitened).
+
+        The chi-square is multiplied by `shrink`.
+        """
         chi2, dof = float(white @ white) * shrink, len(white)
         return cls(chi2, dof, float(chi2_sf(chi2, dof)))
 
@@ -132,7 +135,7 @@ def chi_square(
 
 
 def known_terms(cov: Float) -> Bool:
-    """Boolean mask (n,) that is True for parameters of non-zero variance."""
+    """Boolean mask (n,) that is True for parameters of non-zero variance in `cov` (n, n)."""
     variance = np.diag(cov)
     return np.asarray(variance > 1e-20 * variance.max(initial=0.0))
 

@@ -510,7 +510,7 @@ class Settling:
         return out
 
     def covariance(self, cov: Float, tau: Float) -> Float:
-        """Covariance (D, D) of the transformed parameters, for scatter tau (k,)."""
+        """Covariance (D, D) of transformed parameters, from `cov` (D, D) and scatter tau (k,)."""
         out = self.mean(self.mean(np.asarray(cov)).T)
         for place in self.places:
             out += place.covariance(len(out), float(tau[place.kind]))

@@ -34,7 +34,7 @@ class SharedDrift(DerivedSolution):
     matrix: Float  # matrix (n_tdd, D') from the parameters of `reference` to this drift
 
     def draws(self, n: int, rng: Random) -> Float:
-        """Draws of the source with the drift replaced by draws of the reference's drift."""
+        """Draws (n, D) of the source, with the drift replaced by draws of the reference's drift."""
         generator = generator_of(rng)
         theta = np.array(self.source.draws(n, generator), float)
         drift = np.asarray(self.reference.draws(n, generator), float) @ self.matrix.T

@@ -62,7 +62,7 @@ def pieces_of(starts: Int, size: int) -> Int:
 
 
 def aligned(*shape: int) -> Float:
-    """Array of zeros that is aligned to the cache lines."""
+    """Array of zeros, of the given shape, that is aligned to the cache lines."""
     size = math.prod(shape)
     room = np.zeros(size + 8)
     first = -(room.ctypes.data // 8) % 8
@@ -150,7 +150,7 @@ def at_once(function: Callable[..., Any], *arguments: Iterable[Any]) -> list[Any
 
 @contextmanager
 def threads_for(evaluations: float) -> Iterator[None]:
-    """Context that uses a single thread if there is too little work for several."""
+    """Context that uses a single thread if there are too few evaluations for several."""
     token = _threads.set(get_threads() if evaluations > THREADS_PAY else 1)
     try:
         yield

@@ -25,7 +25,7 @@ _TRSM, _SYRK = _routine("cython_blas", "dtrsm", 11), _routine("cython_blas", "ds
 
 
 def add_square(total: Float, rows: Float) -> None:
-    """Add R^T R to the lower triangle of a matrix (n, n), with R = `rows` (m, n).
+    """Add R^T R to the lower triangle of the matrix `total` (n, n), with R = `rows` (m, n).
 
     Both are C-contiguous float64 arrays; otherwise ValueError is raised.
     """
@@ -59,7 +59,10 @@ def cholesky(matrix: Float) -> Float:
 
 
 def inverse_of(factor: Float) -> Float:
-    """Lower triangle of (L L^T)^-1, with zeros above; L, from `cholesky`, is overwritten."""
+    """Lower triangle (n, n) of (L L^T)^-1, with zeros above; `factor` L is overwritten.
+
+    L is the result of `cholesky`.  Raises LinAlgError if it is singular.
+    """
     n, info = _order(factor, factor.flags.f_contiguous), ctypes.c_int()
     _POTRI(b"L", _at(n), factor.ctypes.data, _at(n), _at(info))
     if info.value:
@@ -68,7 +71,10 @@ def inverse_of(factor: Float) -> Float:
 
 
 def divided(factor: Float, values: Float) -> Float:
-    """Solve L x = values (n, n) in place; both arrays must be Fortran-contiguous."""
+    """Solve L x = `values` (n, n) in place, with the lower triangular `factor` L (n, n).
+
+    Both arrays must be Fortran-contiguous and of equal shape; otherwise ValueError is raised.
+    """
     n, unity = _order(factor, factor.flags.f_contiguous), ctypes.c_double(1.0)
     if _order(values, values.flags.f_contiguous).value != n.value:
         raise ValueError("the shape of the values differs from that of the factor")

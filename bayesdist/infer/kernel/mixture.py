@@ -171,7 +171,7 @@ class Constants(NamedTuple):
     radius: float = 0.0
 
     def of(self, rows: slice) -> Constants:
-        """Constants of a subset of the parameter vectors."""
+        """Constants of a subset of the parameter vectors, given by a slice."""
         j2, log_f, log_1_f, out = (c[rows] for c in self[:4])
         return Constants(j2, log_f, log_1_f, out, self.kind, self.unit2, self.radius)
 

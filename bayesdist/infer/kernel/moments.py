@@ -436,7 +436,7 @@ def mixture_moments(
 
 
 def mixture_sums(total: Float, scalars: Float, order: int, em: bool) -> Moments:
-    """`Moments` of a mixture from sums (G, COLUMNS, M) over the stars of each group."""
+    """`Moments` of a mixture from sums `total` (G, COLUMNS, M) over the stars of each group."""
     K = (order + 1) * (order + 2) // 2
     weight = _matrices(total[:, :3], order)
     cross = total[:, 5:11, :K].reshape(len(total), N_HYPER, 2, K).copy()

@@ -181,10 +181,11 @@ def checked_stars(
     weight: ArrayLike | None,
     chip: Chip,
 ) -> tuple[Float, Float, Float, Float, Float]:
-    """Convert the columns of the stars to float64 arrays and check them.
+    """Convert the columns of the N stars to float64 arrays and check them.
 
-    Raises InputError if shapes are inconsistent, there are no stars, values are not finite,
-    variances are not positive, or weights are outside 0 to 1.
+    `x`, `y` and `weight` have shape (N,), and `shift` and `variance` (N, 2); the weight is 1 by
+    default. Raises InputError if shapes are inconsistent, there are no stars, values are not
+    finite, variances are not positive, or weights are outside 0 to 1.
     """
     location = f"look-up table of chip {chip.number}"
     px = np.atleast_1d(np.asarray(x, float))

@@ -152,7 +152,7 @@ class NodeGrid:
 
     @cached_property
     def polynomials_by_lag(self) -> Float:
-        """Projector on the polynomials, summed over all pairs of nodes with the same lag."""
+        """Projector (n_nodes,) on the polynomials, summed over pairs of nodes with equal lag."""
         Q = self.polynomials
         return np.bincount(self.lag.ravel(), (Q @ Q.T).ravel(), self.n_nodes).astype(float)
 

@@ -88,7 +88,7 @@ class AxisField:
 
     @classmethod
     def of(cls, evidence: Evidence, field: FittedField) -> AxisField:
-        """Posterior with the hyperparameters of `field`, which is of the same stars."""
+        """Posterior with the hyperparameters of `field`, which was fitted to the same stars."""
         sums = evidence.sums
         n = len(sums.polynomial) + field.n_effective
         return cls(NodeCovariance(evidence.grid, sums, field.prior), field, field.mean, n)

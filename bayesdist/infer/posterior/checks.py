@@ -30,7 +30,10 @@ FIT, SAMPLING = "Fit", "Sampling"
 
 
 def scatter_too_small(total: float, dof: float) -> bool:
-    """True if chi-square is significantly too small: residuals scatter less than quoted errors."""
+    """True if the chi-square `total` is significantly too small for `dof` degrees of freedom.
+
+    The residuals then scatter less than their quoted errors.
+    """
     by_chance = float(chi2_cdf(total, max(dof, 1)))
     return total < CHI2_TOO_SMALL.value * dof and by_chance < CHI2_TOO_SMALL_CHANCE.value
 

@@ -54,7 +54,7 @@ class Memberships:
 def some_draws(theta: Float, h: Float, n_stars: int) -> tuple[Float, Float]:
     """Evenly spaced subset of the draws theta (n, D) and h (n, n_hyper).
 
-    It is smaller if there are more stars, because the posterior is then narrower.
+    The subset is smaller if there are more stars, because the posterior is then narrower.
     """
     n = int(np.clip(EVALUATIONS // n_stars, LEAST_DRAWS, MOST_DRAWS))
     rows = np.linspace(0, len(theta) - 1, min(n, len(theta))).astype(int)
@@ -137,9 +137,10 @@ def star_log_likelihood(
 
 
 def count_outliers(shards: Shards, hyper: Hyper, theta: Float, h: Float) -> tuple[int, float]:
-    """Number of stars with outlier probability above 0.5, and expected number of false matches.
+    """Count stars of outlier probability above 0.5, and expected false matches.
 
-    `theta` (n, D) and `h` (n, n_hyper) are all posterior draws; a subset of them is averaged.
+    `theta` (n, D) and `h` (n, n_hyper) are all posterior draws; the result is averaged over a
+    subset.
     """
     theta, h = some_draws(theta, h, len(shards))
     flagged, expected = shards.sum(_count, theta, hyper.constants(h))

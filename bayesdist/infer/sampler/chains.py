@@ -102,7 +102,7 @@ class Chains:
         return np.swapaxes(self.log_prob, 1, 2).reshape(len(self.log_prob), -1)
 
     def info(self, seed: int, started: float) -> SamplerInfo:
-        """Record of the run; `started` is its start according to `time.monotonic`."""
+        """Record of the run with this seed; `started` is its start as given by `time.monotonic`."""
         return SamplerInfo(
             method=f"emcee {self.plan.method}",
             ensembles=len(self.psi),

@@ -133,7 +133,7 @@ class Ensembles:
 
         If the pilot has too few proposals for the walkers, additional ones are evaluated.  Returns
         the states, the mask (ensembles, n) of pilot proposals that were used, and the number of
-        additional evaluations.
+        additional evaluations.  Raises InputError if hardly any proposal is inside the support.
         """
         batches, W = [self.pilot], self.plan.walkers
         while (fewest := min(len(_usable(batches, e)) for e in range(len(self.seeds)))) < W:

@@ -131,7 +131,10 @@ class Whitening:
 
     @classmethod
     def of(cls, target: Density, proposal: Proposal, draws: Float) -> Whitening:
-        """Whitening from the best node of a proposal and the hyperparameters of draws (n, D)."""
+        """Whitening from the best node of a proposal and the hyperparameters of `draws` (n, D).
+
+        The parameters theta of the `target` are whitened by the covariance at that node.
+        """
         n = target.n_theta
         factor = proposal.best.factor.matrix.without_tail().factor()
         hyper = draws[:, n:]
@@ -144,7 +147,7 @@ class Whitening:
         return self.factor.matrix.size
 
     def to_psi(self, w: Float) -> Float:
-        """Convert whitened coordinates (n, D) to sampled coordinates psi (n, D)."""
+        """Convert whitened coordinates `w` (n, D) to sampled coordinates psi (n, D)."""
         n = self.n_theta
         parts = [self.factor.colour(w[:, :n]), w[:, n:] * self.scale]
         return self.centre + np.concatenate(parts, axis=1)

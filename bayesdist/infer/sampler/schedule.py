@@ -67,6 +67,8 @@ def plan_moves(
 ) -> Plan:
     """Choose the moves from the importance efficiency and the Pareto k of the proposal.
 
+    `walkers` is the number of walkers per ensemble; it is chosen if it is None.
+
     The acceptance rate is not used, because it looks good even if the proposal misses a tail.
     `n_proposals` is the number of draws from which efficiency and k were estimated.  If there are
     few, a k above its limit does not yet exclude independence moves, since more proposals are
@@ -198,8 +200,8 @@ def _chance_rhat(limits: Limits, n_params: int, ensembles: int) -> float:
 def first_check(limits: Limits, cost: float, n_params: int, ensembles: int, walkers: int) -> float:
     """Number of draws after warm-up at the first check.
 
-    `cost` is the number of draws per effective draw, and `walkers` the number of walkers per
-    ensemble.
+    `cost` is the number of draws per effective draw.  `n_params` and `ensembles` are numbers of
+    parameters and of ensembles, and `walkers` is the number of walkers per ensemble.
     """
     slack = 1.05 + 3 / np.sqrt(max(limits.ess, 1.0))  # allows for the scatter of estimated ESS
     return max(
@@ -210,7 +212,7 @@ def first_check(limits: Limits, cost: float, n_params: int, ensembles: int, walk
 
 
 def next_check(made: int, verdict: Convergence, n_stars: int, walkers: int) -> float:
-    """Number of draws at the next check, from the last diagnostics `verdict` and its criteria.
+    """Number of draws at the next check, from the last diagnostics and their criteria, `verdict`.
 
     `made` is the number of draws at the last check, and `walkers` the total number of walkers of
     all ensembles.
@@ -226,7 +228,10 @@ def next_check(made: int, verdict: Convergence, n_stars: int, walkers: int) -> f
 
 
 def expected_passes(n_params: int, n_stars: int, limits: Limits, ensembles: int = 4) -> int:
-    """Expected number of passes of a run with a good proposal, including pilot and warm-up."""
+    """Expected number of passes of a run with a good proposal, including pilot and warm-up.
+
+    A pass is the evaluation of one proposal for all stars.
+    """
     walkers = walkers_for(n_stars)
     draws = first_check(limits, 1.1, n_params, ensembles, walkers)
     draws = max(draws, 1.1 * _chance_rhat(limits, n_params, ensembles))

@@ -55,7 +55,10 @@ class Mixture:
     fraction: float = 0.01  # fraction of false detections
 
     def constants(self, log_outlier: float) -> tuple[float, float, float]:
-        """Squared jitter, log of the fraction of true detections, log density of false ones."""
+        """Squared jitter, log of the fraction of true detections, and log density of false ones.
+
+        `log_outlier` is the log density of a detection that is known to be false.
+        """
         with np.errstate(divide="ignore"):
             core, false = np.log([1.0 - self.fraction, self.fraction])
         return self.jitter**2, float(core), float(max(false + log_outlier, -1e300))
@@ -523,7 +526,10 @@ def each_of(
 
 @contextmanager
 def one_cluster(compute: Compute | None) -> Iterator[Compute | None]:
-    """Context in which all calls of `in_pieces` with the yielded `Compute` share one cluster."""
+    """Context in which all calls of `in_pieces` with the yielded `Compute` share one cluster.
+
+    Without dask, `compute` itself is yielded.
+    """
     if compute is None or compute.engine != "dask":
         yield compute
         return

@@ -332,7 +332,11 @@ def _solved(
 
 
 def newton_step(curvature: Float, gradient: Float, free: Int) -> Float | None:
-    """Newton step (D,) of the free parameters; None if the curvature is not positive definite."""
+    """Newton step (D,) of the free parameters; None if their curvature is not positive definite.
+
+    `curvature` (D, D) and `gradient` (D,) are of all parameters; `free` has the indices of the free
+    ones. The step of the others is 0.
+    """
     H = curvature[np.ix_(free, free)]
     if not (np.diag(H) > 0).all():
         return None
@@ -348,7 +352,7 @@ def newton_step(curvature: Float, gradient: Float, free: Int) -> Float | None:
 
 
 def wide_mixture(pieces: MappedPieces[of.StarPiece], theta: Float) -> Mixture:
-    """Mixture with large errors, estimated from the scatter at a starting point."""
+    """Mixture with large errors, estimated from the scatter at the parameters `theta` (D,)."""
     square = np.concatenate(list(pieces.each(of.squares, theta)))
     # the median of r^2 is 1.386 sigma^2
     return Mixture(START_SCALE * float(np.sqrt(np.median(square) / (2 * np.log(2)))), 0.02)

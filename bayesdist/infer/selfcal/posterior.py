@@ -100,7 +100,10 @@ class SelfTarget:
         return out
 
     def mixtures(self, hyper: Float) -> Float:
-        """Jitter in pixels and fraction of false detections (n, 2) from sampled coordinates."""
+        """Convert sampled coordinates to jitter (pixels) and fraction of false detections.
+
+        The result has shape (n, 2).
+        """
         values = self.hyper.values(hyper)
         j = values.get("j", np.full(len(hyper), self.mixture.jitter or 0.0))
         return np.stack([j, values["f"]], axis=1)

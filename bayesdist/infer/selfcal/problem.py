@@ -164,7 +164,7 @@ class Problem:
         return np.array([self.model.basis(chip).half_size for chip in chips])
 
     def jacobians(self, theta: Float, rows: slice) -> Float:
-        """Derivatives (n, 2, 2) of the sky positions of some detections with respect to pixels."""
+        """Derivatives (n, 2, 2) of sky positions with respect to pixels, for some detections."""
         g = self.groups.index[rows]
         with threads_for(len(g)):
             by = kernel.slopes(g, self.X[rows], self.Y[rows], self.powers(theta), self.model.order)
@@ -191,7 +191,10 @@ class Problem:
         return self._means(self.places(theta))
 
     def shifts(self, before: Float, after: Float) -> Float:
-        """Mean shift (S, 2) of the detections of each star if parameters (D,) change."""
+        """Mean shift (S, 2) of the detections of each star, if parameters (D,) change.
+
+        `before` and `after` are the parameters before and after the change.
+        """
         change = self.powers(after) - self.powers(before)
         with threads_for(len(self.X)):
             z = kernel.positions(self.groups.index, self.X, self.Y, change, self.model.order)

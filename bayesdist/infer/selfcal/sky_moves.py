@@ -23,7 +23,10 @@ POINTS = ("zero_point_u", "zero_point_v")
 
 
 def parameter_scale(model: DistortionModel, theta: Float, years: float = 1.0) -> Float:
-    """Change (D,) of each parameter that moves positions at the detector's edge by one pixel."""
+    """Change (D,) of each parameter that moves positions at the detector's edge by one pixel.
+
+    `years` is the time after which a time-dependent parameter has this effect.
+    """
     pixel = model.pixel_size(theta)
     half = max(max(c.size) for c in model.chips) / 2
     out = np.empty(model.n_params)

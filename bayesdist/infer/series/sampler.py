@@ -159,10 +159,11 @@ class Draws:
 def starting_state(
     problem: SeriesProblem, moves: BreakMoves | None, n_chains: int, rng: np.random.Generator
 ) -> State:
-    """Starting states that are widely dispersed in the scatter and in the outliers.
+    """Starting states of the chains, widely dispersed in the scatter and in the outliers.
 
-    The scatter is estimated from differences between consecutive exposures, which are insensitive
-    to breaks and slopes.
+    `moves` are those of the break dates, or None for a trend without unknown breaks.  The scatter
+    is estimated from differences between consecutive exposures, which are insensitive to breaks and
+    slopes.
     """
     k, n = problem.y.shape
     order = np.argsort(problem.series.epoch, kind="stable")
@@ -443,7 +444,11 @@ class SeriesProblem:
     def of(
         cls, series: Series, design: Design, scatter: Float | None = None, *, outliers: bool = True
     ) -> SeriesProblem:
-        """Convert a series to units of its spread; `scatter` (k, k) is the intrinsic covariance."""
+        """Convert a series to units of its spread.
+
+        `scatter` (k, k) is the intrinsic covariance, if it is known.  With `outliers`, exposures
+        may be outliers.
+        """
         unit = series.spread
         square = unit[:, None] * unit
         formal = series.cov / square
@@ -544,7 +549,11 @@ def trend_equations(
 
 
 def break_likelihood(problem: SeriesProblem, precision: Float) -> Likelihood:
-    """Make a function of dates (C, M, B) that returns log likelihoods (C, M), integrated over b."""
+    """Make a function of dates (C, M, B) that returns log likelihoods (C, M).
+
+    The likelihoods are integrated over the coefficients b of the trend.  `precision` has the
+    precision matrices of the exposures.
+    """
 
     def some(breaks: Float) -> Float:
         columns = problem.columns(breaks)
@@ -591,7 +600,7 @@ class BreakMoves:
         return self.dates[gap] + self.width[gap] * rng.random(gap.shape)
 
     def start(self, n_chains: int, likelihood: Likelihood, rng: np.random.Generator) -> Float:
-        """Starting dates (C, B), found by adding one break after the other."""
+        """Starting dates (C, B) of the breaks, found by adding one break after the other."""
         breaks = np.zeros((n_chains, 0))
         for _ in range(self.count):
             gap = np.broadcast_to(np.arange(len(self.width)), (n_chains, len(self.width)))
@@ -608,7 +617,10 @@ class BreakMoves:
         return breaks
 
     def scan(self, breaks: Float, likelihood: Likelihood, rng: np.random.Generator) -> Float:
-        """New dates (C, B), drawn from all gaps, break by break; stores the probabilities."""
+        """Draw new dates (C, B) from all gaps between exposures, one break after the other.
+
+        `breaks` (C, B) are the current dates.  The probabilities of the gaps are stored.
+        """
         for b in range(self.count):
             gap = np.broadcast_to(np.arange(len(self.width)), (len(breaks), len(self.width)))
             trial = self._trial(breaks, b, self._at(gap, rng))
@@ -626,7 +638,7 @@ class BreakMoves:
         self.density = (1 - FROM_PRIOR) * self._seen / total + FROM_PRIOR * self.prior
 
     def move(self, breaks: Float, likelihood: Likelihood, rng: np.random.Generator) -> Float:
-        """New dates (C, B), selected from the current dates and candidates, break by break."""
+        """Select new dates (C, B) from current dates `breaks` and candidates, break by break."""
         n = len(breaks)
         for b in range(self.count):
             gap = rng.choice(len(self.width), size=(n, CANDIDATES), p=self.density[b])
@@ -665,14 +677,18 @@ def draw_scales(sigma: Float, rng: np.random.Generator) -> Float:
 
 
 def scale_prior(k: int) -> tuple[float, float]:
-    """Prior variance of the scales, and degrees of freedom of the inverse Wishart prior."""
+    """Prior variance of the scales, and degrees of freedom of the inverse Wishart prior.
+
+    `k` is the number of coefficients per exposure.
+    """
     return NU * PRIOR_SCALE**2, NU + k - 1
 
 
 def draw_scatter(scale: Float, scatter: Float, count: Float, rng: np.random.Generator) -> Float:
-    """Draw covariances (C, k, k), given the deviations and the scales (C, k) of the prior.
+    """Draw covariances (C, k, k) from their inverse Wishart distribution, given the deviations.
 
-    `scatter` (C, k, k) is the sum of the outer products of `count` (C,) deviations.
+    `scale` (C, k) has the scales of the prior, and `scatter` (C, k, k) the sum of the outer
+    products of `count` (C,) deviations.
     """
     n_chains, k = scale.shape
     psi = scatter + scale[:, :, None] ** 2 * np.eye(k)

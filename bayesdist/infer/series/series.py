@@ -473,7 +473,7 @@ class Drift:
 
     @classmethod
     def over(cls, epoch: Float, n_knots: int, *, smooth: bool) -> Drift:
-        """Make a process for a series with these epochs (E,).
+        """Make a process with at most `n_knots` knots for a series with these epochs (E,).
 
         A smooth process has equidistant knots; those of an irregular one follow the exposures.
         """

@@ -193,7 +193,7 @@ class DerivedSolution(Solution):
 
     @property
     def convergence(self) -> Convergence | None:
-        """Convergence of the source."""
+        """Convergence of the source; None if the source was not sampled."""
         return self.source.convergence
 
 

@@ -247,7 +247,10 @@ class Hyper:
 
     @np.errstate(over="ignore", invalid="ignore")
     def core(self, h: Float) -> Float:
-        """Variance (...) per axis of true matches with the median quoted error."""
+        """Variance (...) per axis of true matches with the median quoted error.
+
+        `h` (..., n_hyper) are the hyperparameters.
+        """
         if self.mixture.jitter is None:
             return np.asarray(self.scale**2 + np.exp(2 * h[..., 0]))
         return np.full(h.shape[:-1], self.scale**2 + self.mixture.jitter**2)

@@ -57,7 +57,7 @@ class Stars:
         return () if self.off_u is None or self.off_v is None else (self.off_u, self.off_v)
 
     def circle(self, constants: Constants) -> tuple[Float, ...]:
-        """Columns `offsets` if the constants have a match circle; otherwise empty."""
+        """Columns `offsets`, each (N,), if the constants have a match circle; otherwise empty."""
         return self.offsets if constants.radius else ()
 
     @property

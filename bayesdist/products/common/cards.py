@@ -32,7 +32,7 @@ def number_card(keyword: str, value: float | int, comment: str = "") -> str:
 
 
 def ascii_card(card: str) -> str:
-    """Card with ? in place of characters that are not allowed in a header; same length."""
+    """Replace characters of a card that are not allowed in a header by ?; the length is kept."""
     return _UNPRINTABLE.sub("?", card)
 
 
@@ -45,7 +45,10 @@ def text_card(keyword: str, value: str, comment: str = "") -> str:
 
 
 def wrapped_cards(keyword: str, lines: Iterable[str], width: int = 70) -> list[str]:
-    """COMMENT or HISTORY cards for wrapped lines; an empty line gives one card."""
+    """Wrap lines to `width` characters and return COMMENT or HISTORY cards.
+
+    An empty line gives one empty card.
+    """
     return [text_card(keyword, part) for line in lines for part in wrap(line, width) or [""]]
 
 
@@ -69,7 +72,10 @@ def tangent_cards(
     cd: Float,
     comment: str = "",
 ) -> list[str]:
-    """World-coordinate cards of a tangent plane in degrees; `comment` explains the CTYPE."""
+    """Cards of the WCS of a tangent plane in degrees; `comment` explains the CTYPE.
+
+    `cd` (2, 2) is in degrees per pixel.
+    """
     return [
         number_card("WCSAXES", 2),
         text_card("CTYPE1", ctype[0], comment),

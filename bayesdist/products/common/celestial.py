@@ -195,7 +195,7 @@ def projection_code(header: fits.Header) -> str:
 
 
 def refuse_projection(code: str, where: str) -> None:
-    """Raise the InputError for a projection that is not supported."""
+    """Raise InputError for a projection that is not supported, given by its code, as 'ZEA'."""
     name = _NAMES.get(code, f"{_article(code)} {code} projection")
     raise InputError(f"is {name}, and bayesdist holds TAN alone", where=where, do=_SAMPLE)
 

@@ -107,7 +107,7 @@ class Hdu:
 
     @cached_property
     def image(self) -> Float:
-        """Pixels of an image extension."""
+        """Pixels (ny, nx) of an image extension."""
         return np.asarray(fits.ImageHDU.fromstring(self.to_bytes()).data, float)
 
 

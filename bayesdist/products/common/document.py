@@ -73,7 +73,7 @@ def of_part(part: str, findings: Iterable[Finding]) -> list[Finding]:
 
 
 def repeated_values(coefficients: Mapping[str, float]) -> list[tuple[str, ...]]:
-    """Groups of names with non-zero values of equal magnitude.
+    """Groups of names with non-zero values of equal magnitude, from coefficients by name.
 
     Two fitted numbers never agree to the last digit: one of them has been copied over the other, as
     in tables that went through text extraction.
@@ -98,7 +98,7 @@ def missing_identity(header: fits.Header) -> list[Finding]:
 
 
 def finding_lines(findings: Sequence[Finding]) -> list[str]:
-    """Lines of text, the most severe finding first."""
+    """Findings as lines of text, the most severe finding first."""
     if not findings:
         return ["Findings: none"]
     ordered = sorted(findings, key=lambda f: LEVELS.index(f.level))

@@ -36,7 +36,9 @@ def cd_matrix(header: fits.Header, where: str) -> Float:
 
 
 def image_size(header: fits.Header) -> tuple[int, int] | None:
-    """Columns and rows stated in a header; a side of one pixel counts as a placeholder.
+    """Columns and rows stated in a header; None if it states none.
+
+    A side of one pixel counts as a placeholder.
 
     A compressed image is a table with its size in ZNAXIS. HST headers have NPIX if all pixels have
     one value and there are no data.

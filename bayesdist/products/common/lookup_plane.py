@@ -27,7 +27,10 @@ class Plane:
         return self.hdu.header
 
     def number(self, keyword: str, default: float) -> float:
-        """Value of a keyword; raises FormatError if it is not a finite number."""
+        """Value of a keyword, `default` if it is missing.
+
+        Raises FormatError if it is not a finite number.
+        """
         value = self.header.get(keyword, default)
         a_number = isinstance(value, int | float) and not isinstance(value, bool)
         if not a_number or not np.isfinite(value):

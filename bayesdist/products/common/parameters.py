@@ -94,7 +94,7 @@ def parameters_hdu(calibration: Calibration, epoch: float | None = None) -> fits
 
 
 def parameters_content(calibration: Calibration, epoch: float | None = None) -> bytes:
-    """FITS file that holds only the parameter table."""
+    """Content of a FITS file that holds only the parameter table, at `epoch` (decimal year)."""
     return fits_bytes([fits.PrimaryHDU(), parameters_hdu(calibration, epoch)])
 
 
@@ -166,14 +166,20 @@ def _further(header: fits.Header) -> list[dict[str, Any]]:
 
 
 def largest_difference(a: Calibration, b: Calibration, number: int, nodes: int = _GRID) -> float:
-    """Largest distance between the positions of two calibrations over a chip, in pixels."""
+    """Largest distance between the positions of two calibrations on chip `number`, in pixels.
+
+    The grid has `nodes` points along each axis.
+    """
     x, y = detector_grid(a.model.chips[a.model.chip_code(number)].size, nodes)
     far = np.hypot(*(a.forward(x, y, chip=number) - b.forward(x, y, chip=number)).T)
     return float(far.max() / np.sqrt(abs(np.linalg.det(a.chip(number).linear))))
 
 
 def refuse_other(far: float, most: float, where: str) -> None:
-    """Raise FormatError if a file differs from its parameters by more than `most` pixels."""
+    """Raise FormatError if a file differs from its parameters by more than `most` pixels.
+
+    `far` is the largest difference in pixels.
+    """
     if not far <= most:
         raise FormatError(
             f"the parameters beside it are off by {far:.2g} pixels: one of the two was changed",
@@ -183,9 +189,10 @@ def refuse_other(far: float, most: float, where: str) -> None:
 
 
 def agreeing(stored: Calibration, read: Calibration) -> Calibration:
-    """Stored calibration, after checking that the calibration read from the product agrees.
+    """Return the stored calibration, after checking that `read` agrees with it.
 
-    Raises FormatError if chips or units differ, or if positions differ by more than `AGREE` pixels.
+    `read` is the calibration read from the product.  Raises FormatError if chips or units differ,
+    or if positions differ by more than `AGREE` pixels.
     """
     chips = [(c.number, c.size) for c in stored.model.chips]
     if chips != [(c.number, c.size) for c in read.model.chips] or stored.unit != read.unit:
@@ -200,7 +207,10 @@ def agreeing(stored: Calibration, read: Calibration) -> Calibration:
 
 
 def refuse_changed(off: float, header: fits.Header, where: str) -> None:
-    """Raise FormatError if tables differ from the parameters by more than the header states."""
+    """Raise FormatError if tables differ from the parameters by more than the header states.
+
+    `off` is the largest difference in pixels.
+    """
     if not off <= 1.5 * float(header.get("BDWORST", 0.0)) + _SLACK:
         raise FormatError(
             f"its tables are off by {off:.2g} pixels from its parameters: one was changed",

@@ -50,7 +50,7 @@ class DistortionFile:
 
     @property
     def size(self) -> tuple[float, float] | None:
-        """Columns and rows: from the record, or else those of the known detector."""
+        """Columns and rows, from the record or of the known detector; None if unknown."""
         nominal = None if self.detector is None else self.detector.size
         if self.record is None:
             return nominal
@@ -63,7 +63,7 @@ class DistortionFile:
 
     @property
     def stated_closure(self) -> float | None:
-        """Largest error of the inverse as stated in the file, in pixels."""
+        """Largest error of the inverse in pixels, as stated in the file; None if not stated."""
         inverse = {} if self.record is None else self.record.get("inverse", {})
         return inverse.get("closure_pix")
 
@@ -73,7 +73,7 @@ class DistortionFile:
         return ARCSEC.get(self.units[1], 1.0) * at
 
     def grid(self) -> tuple[Float, Float]:
-        """FITS 1-based pixels x, y on a grid over the detector.
+        """FITS 1-based pixels x, y (N,) on a grid over the detector.
 
         Raises MissingSizeError if the size of the detector is unknown.
         """
