@@ -61,7 +61,7 @@ class BudgetTerm:
 
     @property
     def radial(self) -> Float:
-        """Radial errors hypot(u, v), shape (P,)."""
+        """Radial errors hypot(u, v), shape (P,), in the unit of the budget."""
         return np.hypot(self.u, self.v)
 
     def on(self, chip: int, rows: slice) -> BudgetTerm:
@@ -236,7 +236,7 @@ class ErrorBudget:
 
     @property
     def radial(self) -> Float:
-        """Total radial error (P,)."""
+        """Total radial error (P,), in `unit`."""
         return self.total.radial
 
     @property

@@ -33,7 +33,7 @@ CONSTANT = 1e-9  # relative change below which moments are taken as independent 
 
 @dataclass(frozen=True, eq=False)
 class BudgetSpan:
-    """Moments within one segment of the drift."""
+    """Moments of the errors within one segment of the drift."""
 
     # epochs from the first to the last, decimal years, between which moments are interpolated by
     # Lagrange's polynomial; empty for a model without time dependence

@@ -103,6 +103,7 @@ class Evaluation:
     Parameters
     ----------
     settings : EvaluationSettings
+        Settings of the evaluation.
     formal, maps : tuple of UncertaintyMap
         Uncertainty of each chip: formal errors of the least-squares solution, and all errors that
         neighbouring positions share.
@@ -116,6 +117,7 @@ class Evaluation:
         Error budget at every position and epoch; None if stated errors contradict the residuals, or
         if the field is only a part of the detector.
     margins : tuple of Margin
+        Verdict on each requirement, with its margin.
     validity : tuple of ValidityPeriod
         Periods in which requirements are met; empty if nothing depends on time.
     checks : tuple of Check

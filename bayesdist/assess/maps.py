@@ -45,6 +45,7 @@ class UncertaintyMap:
     correlation : ndarray, shape (ny, nx)
         Correlation between u and v; 0 where one of them is known exactly.
     unit : str
+        Unit of the standard deviations.
     chip : int
         Chip number.
     epoch : float or None
@@ -87,12 +88,12 @@ class UncertaintyMap:
 
     @property
     def radius(self) -> Float:
-        """hypot(sigma_u, sigma_v), (ny, nx): half the diagonal of the +-1 sigma error box."""
+        """hypot(sigma_u, sigma_v), (ny, nx), in `unit`: half the diagonal of the error box."""
         return np.hypot(self.sigma_u, self.sigma_v)
 
     @property
     def per_axis(self) -> Float:
-        """Rms of sigma_u and sigma_v, (ny, nx): the standard deviation per axis."""
+        """Rms of sigma_u and sigma_v, (ny, nx), in `unit`: the standard deviation per axis."""
         return per_axis(self.sigma_u, self.sigma_v)
 
     def circular_error(self, probability: float) -> Float:
@@ -111,7 +112,7 @@ class UncertaintyMap:
 
     @property
     def radius_max(self) -> float:
-        """Largest radius: the "max radius" of WSDC D-T033, section 6."""
+        """Largest radius, in `unit`: the "max radius" of WSDC D-T033, section 6."""
         return float(np.nanmax(self.radius))
 
     @property
@@ -121,12 +122,12 @@ class UncertaintyMap:
 
     @property
     def sigma_u_max(self) -> float:
-        """Largest sigma_u."""
+        """Largest sigma_u, in `unit`."""
         return float(np.nanmax(self.sigma_u))
 
     @property
     def sigma_v_max(self) -> float:
-        """Largest sigma_v."""
+        """Largest sigma_v, in `unit`."""
         return float(np.nanmax(self.sigma_v))
 
 
@@ -245,7 +246,8 @@ def circular_error(
 
     Returns
     -------
-    ndarray
+    ndarray, shape of the arguments
+        Radius.
 
     Examples
     --------

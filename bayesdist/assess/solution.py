@@ -89,7 +89,7 @@ class ChipFrame:
         return self.centre[:, None] + self.turn @ (np.stack([x, y]) - self.middle[:, None])
 
     def outline(self, size: tuple[float, float]) -> Float:
-        """Corners (4, 2) of a chip of the given size in the focal plane."""
+        """Corners (4, 2) of a chip with these columns and rows in the focal plane, in pixels."""
         right, top = size[0] + 0.5, size[1] + 0.5
         return self(np.array([0.5, right, right, 0.5]), np.array([0.5, 0.5, top, top])).T
 

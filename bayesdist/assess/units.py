@@ -19,6 +19,7 @@ def convert(
     Parameters
     ----------
     value : float or ndarray
+        Length in `from_unit`.
     from_unit, to_unit : str
         'pix', 'arcsec', 'mas' or 'deg'.
     pixel_scale : float, optional

@@ -60,7 +60,7 @@ class VectorMap:
 
     @property
     def length_max(self) -> float:
-        """Largest length."""
+        """Largest length, in `unit`."""
         return float(self.length.max())
 
     @property

@@ -80,12 +80,12 @@ class Positions:
 
     @property
     def sigma_x(self) -> Float:
-        """Standard deviations (N,) of x; NaN if unknown."""
+        """Standard deviations (N,) of x, in the unit of x; NaN if unknown."""
         return self._sigma(0)
 
     @property
     def sigma_y(self) -> Float:
-        """Standard deviations (N,) of y; NaN if unknown."""
+        """Standard deviations (N,) of y, in the unit of y; NaN if unknown."""
         return self._sigma(1)
 
     @property

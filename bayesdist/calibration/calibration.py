@@ -727,6 +727,7 @@ def calibration_of(
     plane : Plane, optional
         By default the tangent plane of the solution, or a free plane if it has no tangent point.
     detector, filter : str, optional
+        Names of the detector and of the filter, if they are known.
     scale : tuple of (float, str), optional
         Size of a corrected pixel in the unit of u and v, and its source; by default 1 for u and v
         in pixels.

@@ -274,10 +274,12 @@ class ChipMap:
         Parameters
         ----------
         order : int
+            Total order of the polynomial.
 
         Returns
         -------
         polynomial : ChipMap
+            Map without look-up tables.
         worst, rms : float
             Largest and rms residual in pixels.
         """

@@ -87,11 +87,11 @@ class Budget:
         return int(max(self.limits.rows, self.limits.rows_per_byte * self.size))
 
     def refuse_content(self, n_bytes: float) -> None:
-        """Refuse more than the allowed bytes of columns or decompressed content."""
+        """Raise FormatError for too many bytes of columns or of decompressed content."""
         self._refuse_bytes(n_bytes, self.content)
 
     def refuse_arrays(self, n_bytes: float) -> None:
-        """Refuse more than the allowed bytes of arrays; see `arrays`."""
+        """Raise FormatError for too many bytes of arrays; see `arrays`."""
         self._refuse_bytes(n_bytes, self.arrays)
 
     def _refuse_bytes(self, n_bytes: float, limit: int) -> None:
@@ -103,7 +103,7 @@ class Budget:
             )
 
     def refuse_rows(self, n: float, verb: str = "announces") -> None:
-        """Refuse a table with more than the allowed rows; `verb` is 'announces' or 'holds'."""
+        """Raise FormatError for a table with too many rows; `verb` is 'announces' or 'holds'."""
         if not n <= self.rows:
             raise FormatError(
                 f"{verb} {n} rows in a file of {size_text(self.size)}",
@@ -112,7 +112,7 @@ class Budget:
             )
 
     def refuse_cells(self, n: float) -> None:
-        """Refuse tables with more than the allowed cells in total."""
+        """Raise FormatError for tables with too many cells in total."""
         limit = max(self.limits.cells, self.limits.cells_per_byte * self.size)
         if not n <= limit:
             raise FormatError(
@@ -122,27 +122,27 @@ class Budget:
             )
 
     def refuse_columns(self, n: int) -> None:
-        """Refuse a table with more than the allowed columns."""
+        """Raise FormatError for a table with too many columns."""
         self._refuse(n, self.limits.columns, "columns", "keep those that are needed")
 
     def refuse_parts(self, n: int, what: str) -> None:
-        """Refuse a file with more than the allowed parts; `what` names them, as in 'HDUs'."""
+        """Raise FormatError for a file with too many parts; `what` names them, as in 'HDUs'."""
         self._refuse(n, self.limits.parts, what, "divide the file")
 
     def refuse_nodes(self, n: int, what: str) -> None:
-        """Refuse a tree with more than the allowed nodes; `what` names them, as in 'cards'."""
+        """Raise FormatError for a tree with too many nodes; `what` names them, as in 'cards'."""
         self._refuse(n, self.limits.nodes, what, DAMAGED)
 
     def refuse_header(self, n: int) -> None:
-        """Refuse a YAML header with more than the allowed characters."""
+        """Raise FormatError for a YAML header with too many characters."""
         self._refuse(n, self.limits.header, "characters in its header", DAMAGED)
 
     def refuse_depth(self, n: int, what: str) -> None:
-        """Refuse more than the allowed nesting depth; `what` names the level, as in 'groups'."""
+        """Raise FormatError for too deep nesting; `what` names the level, as in 'groups'."""
         self._refuse(n, self.limits.depth, f"{what} within each other", DAMAGED)
 
     def refuse_line(self, n: int, number: int) -> None:
-        """Refuse a line with more than the allowed characters; line numbers start at 1."""
+        """Raise FormatError for a line with too many characters; line numbers start at 1."""
         if n > self.limits.line:
             raise FormatError(
                 f"has {n} characters, and at most {self.limits.line} are read",

@@ -222,6 +222,7 @@ class DistortionModel(EffectiveCoefficients):
         Parameters
         ----------
         theta : array_like, shape (n_params,)
+            Parameters of the model.
         x, y, epoch, exposure, chip
             See `predict`.
 
@@ -260,6 +261,7 @@ class DistortionModel(EffectiveCoefficients):
         Parameters
         ----------
         theta : array_like, shape (n_params,)
+            Parameters of the model.
         x, y, epoch, exposure, chip
             See `predict`.
 
@@ -285,6 +287,7 @@ class DistortionModel(EffectiveCoefficients):
         Parameters
         ----------
         theta : array_like, shape (n_params,)
+            Parameters of the model.
         groups : Groups
             Groups of the N pixels, from `groups`.
         x, y : ndarray, shape (N,)
@@ -318,6 +321,7 @@ class DistortionModel(EffectiveCoefficients):
         Parameters
         ----------
         theta : array_like, shape (n_params,)
+            Parameters of the model.
         chip : int, optional
             Chip number; the first chip by default.
 

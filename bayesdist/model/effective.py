@@ -39,6 +39,7 @@ class EffectiveCoefficients(ParameterLayout):
         Parameters
         ----------
         theta : array_like, shape (..., n_params)
+            Parameters of the model.
         chip : ndarray of int, shape (G,)
             Chip codes.
         epoch : ndarray, shape (G,)
@@ -106,11 +107,13 @@ class EffectiveCoefficients(ParameterLayout):
         Parameters
         ----------
         theta : array_like, shape (..., n_params)
+            Parameters of the model.
         groups : Groups
 
         Returns
         -------
         ndarray, shape (..., G, 2, K)
+            In the unit of u and v.
         """
         theta = np.asarray(theta, float)
         out = self.polynomials(theta, groups.chip, groups.epoch)

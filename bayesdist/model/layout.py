@@ -33,6 +33,7 @@ class Chip:
     number : int
         Chip number, as in the data and in calibration files.
     name : str
+        Name of the detector or chip.
     size : tuple of float or Quantity
         Numbers of columns and rows, in pixels.
     reference_pixel : tuple of float or Quantity

@@ -227,7 +227,7 @@ def grid_offsets(n: tuple[int, int], step: tuple[float, float]) -> Float:
 
 
 def rolls_in_turn(n: int, n_offsets: int, rolls: Sequence[float]) -> Float:
-    """Roll angles (n,) of exposures such that every offset is combined with every roll angle.
+    """Roll angles (n,) of exposures such that every offset is combined with each of the `rolls`.
 
     The offsets repeat after `n_offsets` exposures; the roll angles are used cyclically.
     """

@@ -104,7 +104,9 @@ def simulate_matches(
     Returns
     -------
     matches : Matches
+        Simulated matches, with the quoted errors.
     truth : Truth
+        Parameters and false matches.
 
     Raises
     ------

@@ -16,6 +16,7 @@ class Limit:
     Parameters
     ----------
     value : float
+        Number that a diagnostic is compared with.
     sense : str
         'at most' or 'at least': the side of the limit on which the criterion is met.
     reason : str

@@ -235,6 +235,7 @@ def with_mas(
     value : float
         Length in `unit`; a dash is returned if it is not finite.
     unit : str
+        Unit of `value`: 'pix', 'arcsec', 'mas' or 'deg'.
     scale_mas : float or None
         Pixel scale in mas per pixel.
     digits : int

@@ -101,12 +101,12 @@ class Comparison:
 
     @property
     def length(self) -> Float:
-        """Length of the difference, (ny, nx)."""
+        """Length (ny, nx) of the difference, in pixels of A."""
         return np.hypot(self.du, self.dv)
 
     @property
     def largest(self) -> float:
-        """Largest difference on the grid."""
+        """Largest difference on the grid, in pixels of A."""
         return float(self.length.max())
 
     @property
@@ -116,7 +116,7 @@ class Comparison:
 
     @property
     def sigma_of_largest(self) -> float | None:
-        """Standard error of the largest difference, along its direction; None without errors."""
+        """Standard error along the largest difference, in pixels of A; None without errors."""
         if self.sigma_u is None or self.sigma_v is None or self.correlation is None:
             return None
         k = np.unravel_index(int(self.length.argmax()), self.length.shape)
@@ -127,7 +127,7 @@ class Comparison:
 
     @property
     def rms(self) -> float:
-        """Rms length of the difference over the detector."""
+        """Rms length of the difference over the detector, in pixels of A."""
         return float(np.sqrt(self.frame.norm @ self.frame.difference.ravel() ** 2))
 
     @property
@@ -239,7 +239,7 @@ def compare(
 
 
 def term_sigmas(frame: CommonFrame) -> Float:
-    """Standard deviations (2 K,) of the difference; 0 for terms that were removed."""
+    """Standard deviations (2 K,) of the difference in pixels; 0 for terms that were removed."""
     variance, raw = (
         np.diag(required(cov, "neither calibration has errors"))
         for cov in (frame.cov, frame.raw_cov)
@@ -368,7 +368,7 @@ def verdict(found: Comparison, pixel_mas: float | None = None) -> str:
 
 
 def comparison_lines(found: Comparison) -> list[str]:
-    """Lines of text below the verdict."""
+    """Lines of text with the details of a comparison, which follow the verdict."""
     keeps_similarity = not found.frame.taken.shape[1]
     lines = [
         f"{letter}  {c.name}: order {c.basis.order}, in {c.unit}"

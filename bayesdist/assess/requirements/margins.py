@@ -579,7 +579,7 @@ def validity_period(
     grid: tuple[int, int] = DEFAULT_GRID,
     pixel_scale: float | None = None,
 ) -> ValidityPeriod:
-    """Follow a requirement through time.
+    """Probability of meeting a requirement as a function of epoch.
 
     The error at each epoch is that of the drift in the model, extrapolated with its covariance. It
     includes the curvature of the drift that data and prior allow, if the errors contain it.

@@ -87,7 +87,7 @@ class StructureErrors:
         return Together((fit, omitted), remainder=True)
 
     def sigma(self, domain: EvaluationDomain) -> Float:
-        """Standard deviations (N, 2) of the omitted structure, over all draws."""
+        """Standard deviations (N, 2) of the omitted structure, in the unit of u and v."""
         draws = self.draw(self.discrepancy.n_draws, np.random.default_rng(0))
         exposure = None
         if self.frames:
@@ -295,7 +295,7 @@ class LocalErrors:
         return Independent(self.rows[0], self.sigma, sizes, relative_errors)
 
     def sigma(self, domain: EvaluationDomain) -> Float:
-        """Standard deviations (N, 2), interpolated between the nodes of the tables.
+        """Standard deviations (N, 2) in the unit of u and v, interpolated from the tables.
 
         Raises
         ------

@@ -132,7 +132,7 @@ class SizedTerm(ErrorTerm, Protocol):
 
     @property
     def sigma(self) -> float:
-        """Standard deviation; 0 if there is no error."""
+        """Standard deviation, in the unit of the term; 0 if there is no error."""
         ...
 
 
@@ -615,7 +615,7 @@ class KnownField(ErrorField):
     shift: Float
 
     def squares(self) -> dict[str, Float]:
-        """Squares of the displacements, or of their differences."""
+        """Squares (P, 2) of the displacements, or of their differences, by name of the row."""
         pairs = self.domain.pairs()
         moved = self.shift if pairs is None else self.shift[pairs[1]] - self.shift[pairs[0]]
         return {self.rows[0].name: moved**2}

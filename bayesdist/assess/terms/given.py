@@ -195,6 +195,7 @@ class UserTerm:
         Returns
         -------
         sigma_u, sigma_v : float
+            In `unit`.
 
         Raises
         ------
@@ -456,13 +457,13 @@ class Centroids:
         return Independent(self.rows[0], self.sigma)
 
     def sigma(self, domain: EvaluationDomain) -> Float | None:
-        """Standard deviations (N, 2); None if the domain has no magnitude."""
+        """Standard deviations (N, 2) in the unit of u and v; None without a magnitude."""
         if domain.magnitude is None:
             return None
         return np.tile(self.at(domain.magnitude), (domain.size, 1))
 
     def at(self, magnitude: float) -> Float:
-        """Standard deviations (2,) of the centroid of a star.
+        """Standard deviations (2,) of the centroid of a star, in the unit of u and v.
 
         Raises InputError if errors by magnitude are unknown, or were not measured near this one.
         """

@@ -91,9 +91,11 @@ def present_columns(
     source: str,
     read_sigma: bool = True,
 ) -> dict[str, str]:
-    """Column of each quantity that the table has: x, y, either u, v or ra, dec, and optional ones.
+    """Names of the columns by quantity: x, y, either u, v or ra, dec, and optional ones.
 
-    `columns` are those named by the user; errors are omitted unless `read_sigma` is True.
+    `names` are the columns that the table has, and `columns` those chosen by the user, by quantity.
+    Errors are omitted unless `read_sigma` is True.  Raises InputError if a column chosen by the
+    user is not in the table.
     """
     names = list(names)
     present = find_columns(names, columns, ALIASES, source=source, pairs=PAIRS)

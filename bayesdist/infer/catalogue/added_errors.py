@@ -83,12 +83,15 @@ class GroupedErrors:
 
     @property
     def sigma_error(self) -> Float:
-        """Standard errors (G, 2) of `sigma`, limited near zero by those of the variance."""
+        """Standard errors (G, 2) of `sigma`, in the unit of u and v.
+
+        They are limited near zero by the standard errors of the variance.
+        """
         return self.error / (2.0 * np.sqrt(np.maximum(self.variance, self.error)))
 
     @property
     def excess(self) -> Float:
-        """Errors (G, 2) to add in quadrature to the quoted ones, apart from the jitter.
+        """Errors (G, 2) to add in quadrature to the quoted ones, in the unit of u and v.
 
         The smallest added variance is subtracted, because the jitter describes it for all groups.
         """

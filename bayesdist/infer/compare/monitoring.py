@@ -225,7 +225,9 @@ def new_model(released: DistortionModel, matches: Matches) -> DistortionModel:
     Parameters
     ----------
     released : DistortionModel
+        Model of the release.
     matches : Matches
+        The new matches.
 
     Returns
     -------

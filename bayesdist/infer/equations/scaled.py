@@ -100,6 +100,7 @@ def chi_square(
     Parameters
     ----------
     difference : ndarray, shape (n,)
+        Differences between the coefficients.
     cov : ndarray, shape (n, n)
         Covariance of the difference, before any field is removed. Terms of zero variance are
         excluded from the test.

@@ -79,7 +79,7 @@ class Scatter:
         return self.about + factor.solve(self.right - diagonal * self.about), factor
 
     def posterior(self, tau: Float) -> tuple[Float, ArrowFactor]:
-        """Mean of theta (D,) and factor of its precision for given tau (k,), with `caution`."""
+        """Mean (D,) of theta and factor of its precision, for tau (k,) multiplied by `caution`."""
         return self._moments(self.prior(tau))
 
     def log_density(self, tau: Float) -> float:

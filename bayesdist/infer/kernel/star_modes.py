@@ -146,7 +146,9 @@ def add_curvature(A, S, q, h0, h1, h2):
 def hessian(i, own, wu, wv, s2, w, observed):
     """Minus the second derivatives (uu, uv, vv) of a detection's log density in position.
 
-    They are exact if `observed` is True, otherwise those with the EM weight.
+    `w` is its probability of being true, `wu` and `wv` are its weighted residuals, and `s2` is the
+    factor on its variances.  The derivatives are exact if `observed` is True; otherwise w is held
+    fixed, as in the EM algorithm.
     """
     whole_vectors()
     core = w / s2

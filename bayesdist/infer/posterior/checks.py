@@ -45,6 +45,7 @@ class ChiSquare:
     Parameters
     ----------
     total : float
+        Chi-square of both axes.
     dof : float
         Degrees of freedom.
     in_circle : bool

@@ -50,6 +50,7 @@ class SamplerInfo:
     wall_s : float
         Wall-clock time of this session in seconds.
     seed : int
+        Seed of the random numbers.
     """
 
     method: str

@@ -149,7 +149,7 @@ class Problem:
         return basis.to_scaled_powers(self.effective(theta))
 
     def places(self, theta: Float) -> Float:
-        """Sky position (N, 2) of each detection according to the model."""
+        """Position u, v (N, 2) of each detection on the sky, according to the model."""
         powers = self.powers(theta)
         with threads_for(len(self.X)):
             positions = kernel.positions(
@@ -171,7 +171,7 @@ class Problem:
         return np.asarray(by / self._half[g, None])
 
     def star_places(self, stars: Float) -> Float:
-        """Sky position (N, 2) of the star of each detection at the date of the detection."""
+        """Position u, v (N, 2) of the star of each detection, at the date of the detection."""
         out = stars[self.star, :2]
         if self.n_star >= 4:
             out = out + stars[self.star, 2:4] * self.time[:, None]
@@ -187,7 +187,7 @@ class Problem:
         )
 
     def middles(self, theta: Float) -> Float:
-        """Mean sky position (S, 2) of the detections of each star."""
+        """Mean position u, v (S, 2) of the detections of each star."""
         return self._means(self.places(theta))
 
     def shifts(self, before: Float, after: Float) -> Float:

@@ -91,6 +91,7 @@ class Comparison:
         Returns
         -------
         value, error : float
+            Difference and standard error.
         """
         each = self.scores[a].log_density - self.scores[b].log_density
         fold = self.scores[a].fold

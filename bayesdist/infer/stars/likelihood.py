@@ -425,7 +425,7 @@ class ClippedGaussian:
         return self.clip.keeps_of(stars).astype(float)
 
     def variances(self, stars: Stars) -> Float:
-        """Variances (2, N) from the quoted errors."""
+        """Variances (2, N) from the quoted errors, in the unit of u and v squared."""
         return np.stack([stars.var_u, stars.var_v])
 
 
@@ -463,7 +463,7 @@ class MixtureAt:
         return 1.0 - star_averages(stars, self.theta[None], self.constants)[0]
 
     def variances(self, stars: Stars) -> Float:
-        """Variances (2, N) from the quoted errors and the jitter."""
+        """Variances (2, N) from quoted errors and jitter, in the unit of u and v squared."""
         return np.stack([stars.var_u, stars.var_v]) + self.constants.j2[0]
 
 

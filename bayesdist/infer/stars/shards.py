@@ -335,7 +335,7 @@ class Survey:
 
     @property
     def reference_sigma(self) -> float:
-        """Median quoted error per axis, which is the scale of the priors."""
+        """Median quoted error per axis, in the unit of u and v; the scale of the priors."""
         return float(np.sqrt(np.median(np.concatenate(self.variance))))
 
     def check_circle(self, radius: float | None) -> None:

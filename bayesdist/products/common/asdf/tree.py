@@ -91,7 +91,7 @@ def tagged(node: Mapping[str, Any], tag: str, name: str) -> Any:
 
 
 def plain(node: Any) -> Any:
-    """Node with numpy arrays, lists and dictionaries in place of asdf's classes."""
+    """Convert asdf's classes in a node to numpy arrays, lists and dictionaries."""
     if isinstance(node, Mapping):
         return {str(key): plain(value) for key, value in node.items()}
     if isinstance(node, (list, tuple)):
