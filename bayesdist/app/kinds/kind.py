@@ -6,14 +6,14 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar, Generic, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, TypeVar
 
 from bayesdist.app.artefacts.stored_fit import read_stored_fit
 from bayesdist.app.kinds.sampling import sample_stars
 from bayesdist.app.run import Run
 from bayesdist.assess.model import with_diagnosed_errors
 from bayesdist.assess.terms.forms import ErrorTerm
-from bayesdist.data import MagnitudeErrors, ReferenceCatalog
+from bayesdist.data import MagnitudeErrors, Matches, ReferenceCatalog
 from bayesdist.diagnose.holdout.predictive import Predictive, predictive_of
 from bayesdist.diagnose.overlap import OverlapTest
 from bayesdist.infer import Posterior
@@ -24,6 +24,9 @@ from bayesdist.infer.solution.solution import Solution
 from bayesdist.model import DistortionModel, LookupTable
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.checks import Check
+
+if TYPE_CHECKING:
+    from bayesdist.infer.compare.monitoring import NewFit
 
 C = TypeVar("C", contravariant=False)  # configuration
 I = TypeVar("I")  # inputs
@@ -190,6 +193,24 @@ class RunKind(ABC, Generic[C, I]):
     def report_parts(self, run: Run) -> dict[str, Any]:
         """Fields of the content of the report that only this kind has, by their names."""
         return {}
+
+    def fit_of_new_exposures(
+        self, release: Run, new: Path
+    ) -> tuple[Matches, NewFit, tuple[str, ...]] | None:
+        """Fit of new exposures in the file or folder `new`, to test the solution of a run.
+
+        None if new matches are a table that has to be read as those of the run were.
+
+        Returns
+        -------
+        Matches
+            New matches with errors.
+        NewFit
+            Their fit.
+        tuple of str
+            Exposures that are left out because the run was made from them.
+        """
+        return None
 
     # -- stars ------------------------------------------------------------------------------------
 

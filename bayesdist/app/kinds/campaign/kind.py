@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -37,13 +37,16 @@ from bayesdist.assess.model import with_diagnosed_errors
 from bayesdist.assess.terms.correlated import LocalErrors, interpolation_term
 from bayesdist.assess.terms.forms import GIVEN, MEASURED, ErrorTerm
 from bayesdist.assess.terms.parameters import ExposureVariation
-from bayesdist.data import ReferenceCatalog
+from bayesdist.data import Matches, ReferenceCatalog
 from bayesdist.diagnose.holdout.predictive import ExposureDeviations, Predictive, predictive_of
 from bayesdist.diagnose.overlap import OverlapTest
 from bayesdist.infer import Posterior
 from bayesdist.infer.catalogue.star_errors import StarErrors, StarInfluence, star_influence
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.utils.checks import Check
+
+if TYPE_CHECKING:
+    from bayesdist.infer.compare.monitoring import NewFit
 
 SAMPLING = 1  # number of the random stream of the stage 'sample', derived from the seed
 TOGETHER = 1.5  # node spacings over which errors of tables are correlated, from their covariance
@@ -183,6 +186,14 @@ class CampaignKind(RunKind[CampaignConfig, Inputs]):
         from bayesdist.app.kinds.campaign.report import report_fields  # needed by one stage
 
         return report_fields(run)
+
+    def fit_of_new_exposures(
+        self, release: Run, new: Path
+    ) -> tuple[Matches, NewFit, tuple[str, ...]]:
+        """Fit of new exposures, which scatter as those of the release do."""
+        from bayesdist.app.kinds.campaign.monitoring import fit_new_exposures  # for one command
+
+        return fit_new_exposures(release, new)
 
     def catalogue(self, run: Run) -> ReferenceCatalog:
         """Reference catalogue with the stars that are used."""
