@@ -328,7 +328,7 @@ def _even_grid(size: tuple[float, float]) -> tuple[Float, Float]:
 
 
 def chip_of(maps: Mapping[int, ChipMap], number: int, where: str) -> ChipMap:
-    """Map of a chip; raises InputError if the chip is unknown."""
+    """Map of a chip among `maps`, by chip number; raises InputError if the chip is unknown."""
     if number not in maps:
         raise InputError(
             f"there is no chip {number}",
@@ -494,7 +494,7 @@ class FurtherError:
 
 
 def scaled(rows: Sequence[FurtherError], factor: float) -> tuple[FurtherError, ...]:
-    """Multiply u and v of errors by `factor`, to convert them to another unit."""
+    """Multiply u and v of error rows by `factor`, to convert them to another unit."""
     return tuple(replace(row, u=factor * row.u, v=factor * row.v) for row in rows)
 
 

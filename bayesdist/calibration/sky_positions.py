@@ -307,7 +307,11 @@ def coefficient_covariance(calibration: Calibration, epoch: float | None) -> Flo
 def designs(
     calibration: Calibration, maps: Mapping[int, ChipMap], x: Float, y: Float, chip: Int
 ) -> Float:
-    """Derivatives (N, 2, n) of (u, v) with respect to the coefficients of all chips."""
+    """Derivatives (N, 2, n) of (u, v) with respect to the coefficients of all chips.
+
+    `maps` are the maps of the chips by number, and x, y and `chip` (N,) the pixels and chip
+    numbers.
+    """
     K = calibration.model.n_terms
     out = np.zeros((x.size, 2, 2 * K * len(maps)))
     for k, (number, chip_map) in enumerate(maps.items()):

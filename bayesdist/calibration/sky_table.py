@@ -88,7 +88,10 @@ def table_on_sky(
 
 
 def errors_in(calibration: Calibration, centroids: Sequence[str] | None) -> list[tuple[str, str]]:
-    """Errors included in the sky positions, as pairs (name, correlation between stars in words)."""
+    """Errors included in the sky positions, as pairs (name, correlation between stars in words).
+
+    `centroids` are the names of the columns with centroid errors, if there are any.
+    """
     out = []
     if calibration.errors == "covariance":
         out.append(("coefficients, with their covariance", "correlated between stars"))

@@ -389,7 +389,10 @@ def _distances(
 
 
 def is_on_plane(ra: ArrayLike, dec: ArrayLike, point: tuple[float, float]) -> Bool:
-    """Boolean mask (N,) of positions that `tangent_plane` can project; False for NaN."""
+    """Boolean mask (N,) of positions that `tangent_plane` can project; False for NaN.
+
+    Positions and tangent point (ra, dec) are in degrees.
+    """
     return np.asarray(_distances(ra, dec, point)[3] > 0)
 
 
@@ -434,6 +437,8 @@ def tangent_jacobian(
     ra: ArrayLike, dec: ArrayLike, point: tuple[float, float], *, where: str = ""
 ) -> Float:
     """Derivatives (N, 2, 2) of (xi, eta) with respect to displacements to the east and north.
+
+    Positions (N,) and tangent point (ra, dec) are in degrees.
 
     ``J[:, 0, 1]`` is d xi / d dec; a displacement to the east is d ra cos(dec).
     """

@@ -68,9 +68,10 @@ def read_json_as(kind: TypeAdapter[T], path: Path, *, do: str) -> T:
 
 
 def model_of(kind: TypeAdapter[T], tree: Any, where: str, *, do: str) -> T:
-    """Convert a tree to a type.
+    """Convert a tree, as parsed from JSON or TOML, to the type `kind`.
 
-    Raises FormatError with the first key that is invalid.
+    `where` is the file and `do` the advice, for the error message.  Raises FormatError with the
+    first key that is invalid.
     """
     try:
         return kind.validate_python(tree)

@@ -221,7 +221,7 @@ _OF_CODE = (
 
 
 def reason_of(error: Exception) -> str:
-    """First line of the message of an exception about a file, or its type if it has no message."""
+    """First line of the message of an exception about a file; its type if the message is empty."""
     if isinstance(error, _OF_CODE):
         return "it is not laid out as this format demands"
     line = next(iter(str(error).strip().splitlines()), "") or type(error).__name__

@@ -291,7 +291,7 @@ class _Written(io.FileIO):
 
 
 def write_arrays(path: Path, fingerprint: str, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write arrays to an HDF5 file atomically.
+    """Write arrays to an HDF5 file atomically, with a `fingerprint` that `read_arrays` checks.
 
     Raises InputError if the system refuses to write.
     """

@@ -184,7 +184,7 @@ def _after_thrift_value(raw: bytes, at: int, kind: int, depth: int) -> int:
 
 
 def text_columns(schema: pyarrow.Schema) -> frozenset[str]:
-    """Names of the text columns: strings, bytes or dictionaries."""
+    """Names of the text columns (strings, bytes or dictionaries) of a schema."""
     from pyarrow import types
 
     kinds = (

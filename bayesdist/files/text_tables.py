@@ -78,10 +78,11 @@ def _rows_of(lines: Sequence[str]) -> list[str]:
 
 
 def mark_of(rows: Sequence[str]) -> str | None:
-    """Separator between the cells of a table, with the names in the first row; None for blanks.
+    """Separator between the cells of a table in `rows`; None for blanks.
 
-    It is the separator that divides the names and the first row of numbers into the same number of
-    cells. If there is none, it is the first separator that occurs in the names.
+    The first row has the names. The separator is the one that divides the names and the first row
+    of numbers into the same number of cells. If there is none, it is the first separator that
+    occurs in the names.
     """
     names = rows[0]
     present = [mark for mark in _MARKS if mark is None or mark in names]
@@ -226,7 +227,10 @@ def without_empty_names(lines: list[str], mark: str | None) -> list[str]:
 
 
 def refuse_missing_cells(lines: Sequence[str], mark: str, *, where: str) -> None:
-    """Raise FormatError if a row has fewer cells than names; astropy fills it without a warning."""
+    """Raise FormatError if a row has fewer cells, separated by `mark`, than there are names.
+
+    astropy would fill such a row without a warning.
+    """
     width, row = 0, 0
     for cells in csv.reader((line for line in lines if line[:1] != "#"), delimiter=mark):
         if not cells or cells == [""]:
@@ -275,7 +279,7 @@ def columns_of_numbers(table: Table) -> dict[str, bool]:
 def refuse_foreign_numbers(
     columns: Mapping[str, bool], lines: Sequence[str], mark: str | None, *, where: str
 ) -> None:
-    """Refuse cells that Python or C would read as numbers, but that no table format allows.
+    """Raise FormatError for cells that Python or C reads as numbers but no table format allows.
 
     These are digits with underscores ("1_00"), hexadecimal numbers ("0x64"), digits of other
     scripts, and numbers beside blanks that are not ASCII, such as U+00A0. `columns`: True for each

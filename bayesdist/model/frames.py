@@ -100,10 +100,10 @@ def frame_tangent(kind: str, p: ArrayLike) -> Float:
 
 
 def rigid_part(kind: str, p: ArrayLike) -> tuple[Float, Float]:
-    """Rotation R (..., 2, 2) in M, and its derivatives (..., q - 2, 2, 2).
+    """Rotation R (..., 2, 2) in M, the linear part of a frame, and its derivatives.
 
-    The frames have the parameters `p` (..., q); the derivatives are with respect to those after the
-    shifts.
+    The frames are of a `kind` and have the parameters `p` (..., q).  The derivatives (..., q - 2,
+    2, 2) are with respect to the parameters after the shifts.
     """
     p = np.asarray(p, float)
     names = frame_names(kind)[2:]
@@ -130,7 +130,7 @@ def chip_matrix(p: ArrayLike) -> tuple[Float, Float]:
 def nearest_frame(kind: str, M: ArrayLike, d: ArrayLike) -> Float:
     """Parameters (q,) of the frame that is closest to the map M z + d, in the Frobenius norm.
 
-    M is a matrix (2, 2) and d a shift (2,).
+    `kind` is the name of the frame model, M a matrix (2, 2) and d a shift (2,).
     """
     M = np.asarray(M, float)
     # M z = a z + b conj(z) with z = u + i v; a is the similarity nearest to M

@@ -44,8 +44,8 @@ def mesh(x: Float, y: Float) -> tuple[Float, Float]:
 def cell_index(X: Float, Y: Float, bins: tuple[int, int]) -> Int:
     """Index (N,) of the cell that contains each position; the index along x varies fastest.
 
-    X and Y are coordinates scaled to [-1, 1] over the chip.  Positions outside are assigned to the
-    outermost cells.
+    X and Y are coordinates scaled to [-1, 1] over the chip, and `bins` the numbers of cells along x
+    and y.  Positions outside are assigned to the outermost cells.
     """
     ix, iy = (
         np.clip(((z + 1) * (0.5 * n)).astype(np.int64), 0, n - 1)

@@ -219,7 +219,7 @@ def places_of(built: Sequence[Built], target: Path) -> list[Path]:
 
 
 def write_built(built: Sequence[Built], places: Sequence[Path]) -> None:
-    """Write all files to temporary names, then rename them."""
+    """Write built files to temporary names, then rename them to the paths `places`."""
     with ExitStack() as stack:
         # contexts exit in reverse order: each file is renamed after its companions are in place
         for place, part in reversed(list(zip(places, built, strict=True))):

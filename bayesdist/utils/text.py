@@ -74,7 +74,7 @@ def refuse_control_characters(texts: Iterable[str], where: str) -> None:
     """Raise InputError if a name contains a control character, such as a line end, a tab or NUL.
 
     Names are written on one line in tables, headers and reports, and netCDF files end them at NUL.
-    `where` is the location for the error message.
+    `texts` are the names, and `where` is the location for the error message.
     """
     for text in texts:
         found = _CONTROLS.search(text)

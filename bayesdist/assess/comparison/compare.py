@@ -342,7 +342,7 @@ def gap_table(gaps: Sequence[GapDifference]) -> Table:
 
 
 def verdict(found: Comparison, pixel_mas: float | None = None) -> str:
-    """Verdict in one sentence: if the calibrations differ, by how much, and how significantly.
+    """Verdict in one sentence: whether the calibrations differ, by how much, and how significantly.
 
     `pixel_mas`: size of a pixel in mas, if neither side states it.
     """
@@ -454,7 +454,7 @@ def _measured(value: float, sigma: float | None) -> str:
 
 
 def gap_verdict(gap: GapDifference) -> str:
-    """Verdict in one sentence: if the position of a chip relative to the reference chip differs."""
+    """Verdict in one sentence: whether the position of a chip relative to the first one differs."""
     chips, d = f"against chip {gap.reference}", float(np.hypot(*gap.values[:2]))
     if np.abs(gap.values).max() < IDENTICAL:
         return f"Chip {gap.chip} lies alike {chips}, to rounding."

@@ -192,6 +192,8 @@ def compare_patterns(
 ) -> tuple[PlannedPattern, ...]:
     """Compare dither patterns on the same sky; the best one comes first.
 
+    `known` is the prior information on offsets, rolls and scales.
+
     Raises InputError if the exposures of a pattern do not overlap, or if there are too many stars.
     """
     truths = [

@@ -27,7 +27,8 @@ CENTROID_ERRORS = (
 def position_unit(pair: tuple[SourceColumn, SourceColumn], unit: str | None) -> str:
     """Unit ('pix', 'arcsec', 'mas' or 'deg') of two columns, from the file or the option `unit`.
 
-    Raises InputError if both are missing, or if the file, the option or the two columns disagree.
+    `pair` has the columns u and v.  Raises InputError if both are missing, or if the file, the
+    option or the two columns disagree.
     """
     if unit is not None:
         check_unit(unit, where="unit")
@@ -126,7 +127,7 @@ def needed_columns(
 ) -> dict[str, str]:
     """Names of the columns by quantity, as returned by `present_columns`.
 
-    Raises InputError if a needed column is missing.
+    The arguments are those of `present_columns`.  Raises InputError if a needed column is missing.
     """
     names = list(names)
     present = present_columns(names, columns, source=source, read_sigma=read_sigma)
@@ -151,7 +152,12 @@ def needed_columns(
 def columns_read(
     names: Sequence[str], header: Mapping[str, Any], options: ReadOptions, *, source: str
 ) -> tuple[dict[str, str], ReadOptions, tuple[str, ...]]:
-    """Column of each quantity, options with the pixel origin set, and notes on both."""
+    """Names of the columns by quantity, options with the pixel origin set, and notes on both.
+
+    `names` are the columns of the table, and `header` may state the pixel origin.  Raises
+    InputError if a needed column is missing, or an option requires a missing column or contradicts
+    one.
+    """
     needed = needed_columns(names, options.columns, source=source, read_sigma=options.read_sigma)
     _refuse_unused(options, needed, source)
     notes = _unused_centroid_errors(names, needed) if options.read_sigma else ()
@@ -311,7 +317,7 @@ def plane_unit(unit: str | None, *, source: str) -> str:
 def nominal_columns(
     found: Mapping[str, str], *, source: str, tangent_point: tuple[float, float] | None
 ) -> tuple[str, ...]:
-    """'u_nominal' and 'v_nominal' if the table has them, otherwise empty.
+    """'u_nominal' and 'v_nominal' if both are among the quantities `found`, otherwise empty.
 
     Raises InputError if only one is present, or if both are present with sky positions but without
     a tangent point: their plane must not depend on which stars were matched.

@@ -194,9 +194,9 @@ def without_missing(
     """Boolean mask (N,) of rows with a value in every column that is read, and counts by reason.
 
     The counts are those of the other rows. With `reject`, values that are not finite count as
-    missing. Missing values of `spared` quantities are allowed. For `motions`, NaN means that a star
-    has no measured motion, as in catalogues; so do proper motions of exactly 0 on both axes, with a
-    warning. Raises InputError if no row remains.
+    missing. `found` has the column of each quantity, and missing values of `spared` quantities are
+    allowed. For `motions`, NaN means that a star has no measured motion, as in catalogues; so do
+    proper motions of exactly 0 on both axes, with a warning. Raises InputError if no row remains.
     """
     reasons = []
     motion_names = [found[key] for key in MOTION_KEYS if key in found and key not in spared]

@@ -162,7 +162,9 @@ def refitted(
     good: Float,
     priors: GaussianPriors | None,
 ) -> tuple[LinearFit, Float]:
-    """Fit stars with variances (2, N), weighted by the probabilities `good` (N,) of true matches.
+    """Fit stars with given variances (2, N), weighted by the probabilities `good` (N,).
+
+    `good` are the probabilities of true matches.
 
     Returns the fit and its residuals (2, N), data minus model.
     """

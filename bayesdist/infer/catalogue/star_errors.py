@@ -418,7 +418,10 @@ class StarSums:
         return out
 
     def independent(self, influence: list[Float], variances: list[Float]) -> Float:
-        """Covariance (D, D) from the same errors if they were independent between matches."""
+        """Covariance (D, D) from the same errors if they were independent between matches.
+
+        `influence` has one array per group, and `variances` one array (S, 2) per lever.
+        """
         D = influence[0].shape[2]
         out = np.zeros((D, D))
         for g, phi in enumerate(self.phi):

@@ -316,6 +316,6 @@ class Split:
         return np.concatenate([psi[..., :n], z], axis=-1), psi[..., [n + k for k in held]]
 
     def log_jacobian(self, y: Float) -> Float:
-        """Log |d psi / d y| (...)."""
+        """Log of the determinant of d psi / d y, of shape (...), for y (..., D')."""
         h1 = from_cube_root(self.rest, y[..., self.n_theta :])[1]
         return np.asarray(np.log(np.abs(h1)).sum(axis=-1))

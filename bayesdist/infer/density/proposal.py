@@ -306,7 +306,7 @@ class PiecewiseExponential:
         return self.values[anchor] + self.slopes[k] * (x - self.mesh[anchor])
 
     def quantile(self, p: Float) -> Float:
-        """Quantiles (n,) of probabilities (n,)."""
+        """Quantiles (n,) of the density at probabilities p (n,)."""
         m = np.clip(p, 1e-300, 1 - 1e-16) * self.total
         k = np.clip(np.searchsorted(self.cumulative, m, side="right") - 1, 0, len(self.slopes) - 1)
         share = (m - self.cumulative[k]) / (self.cumulative[k + 1] - self.cumulative[k])

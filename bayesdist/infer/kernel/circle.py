@@ -57,7 +57,10 @@ NODES = _table()
 
 @nb.njit(cache=True, forceinline=True, fastmath=FAST)
 def inside(du, dv, A, B, R):
-    """True if the probability outside the circle is below the float64 precision."""
+    """True if the probability outside the circle is below the float64 precision.
+
+    The module explains the arguments.
+    """
     whole_vectors()
     d2 = du * du + dv * dv
     room = R - math.sqrt(d2)
@@ -66,7 +69,10 @@ def inside(du, dv, A, B, R):
 
 @nb.njit(cache=True, forceinline=True, fastmath=FAST)
 def nodes_for(du, dv, A, B, R, counts):
-    """Index of the smallest set of nodes that resolves the integrand."""
+    """Index of the smallest set of nodes, among `counts`, that resolves the integrand.
+
+    The module explains the other arguments.
+    """
     whole_vectors()
     bend = R * math.sqrt(du * du / (A * A) + dv * dv / (B * B)) + R * R * abs(1.0 / A - 1.0 / B)
     wanted = 9.0 + 7.2 * math.sqrt(bend)
@@ -148,7 +154,7 @@ def _log_from_outside(du, dv, A, B, R, n, first, cosine, sine, q, least, work):
 def log_circle(du, dv, A, B, R, nodes, q, work):
     """Logarithm of the probability mass within the circle about d = (du, dv).
 
-    `q` and `work` are scratch arrays of at least `MOST` numbers.
+    The module explains A, B and R.  `q` and `work` are scratch arrays of at least `MOST` numbers.
     """
     whole_vectors()
     if inside(du, dv, A, B, R):

@@ -106,7 +106,10 @@ def design(S, q, i, time, factor):
 
 @nb.njit(cache=True, forceinline=True)
 def residual(i, own, S, p, q):
-    """W times the residual r (two numbers), and r^T W r in square pixels."""
+    """W times the residual r (two numbers) of detection i, and r^T W r in square pixels.
+
+    `own` has the detections (`own_rows`), and p the q parameters of the star; see the module.
+    """
     whole_vectors()
     ru, rv = own[PLACE_U, i], own[PLACE_V, i]
     for k in range(q):
@@ -118,14 +121,20 @@ def residual(i, own, S, p, q):
 
 @nb.njit(cache=True, forceinline=True)
 def far_odds(log_core, log_out):
-    """Ratio of the densities of false and true detections, apart from the factor s^2 / e."""
+    """Ratio of the densities of false and true detections, apart from the factor s^2 / e.
+
+    `log_core` and `log_out` are the logs of the factors of the true and the false term.
+    """
     whole_vectors()
     return 2.0 * math.pi * math.exp(log_out - log_core)
 
 
 @nb.njit(cache=True, forceinline=True)
 def membership(odds, square, s2):
-    """Probability that a detection belongs to its star; `odds` is the result of `far_odds`."""
+    """Probability that a detection belongs to its star.
+
+    `odds` is the result of `far_odds`, `square` is r^T W r and `s2` the variance, in square pixels.
+    """
     whole_vectors()
     near = exp_negative(-0.5 * square / s2)
     return near / (near + odds * s2)

@@ -54,7 +54,8 @@ class Memberships:
 def some_draws(theta: Float, h: Float, n_stars: int) -> tuple[Float, Float]:
     """Evenly spaced subset of the draws theta (n, D) and h (n, n_hyper).
 
-    The subset is smaller if there are more stars, because the posterior is then narrower.
+    The subset is smaller if there are more stars, `n_stars`, because the posterior is then
+    narrower.
     """
     n = int(np.clip(EVALUATIONS // n_stars, LEAST_DRAWS, MOST_DRAWS))
     rows = np.linspace(0, len(theta) - 1, min(n, len(theta))).astype(int)

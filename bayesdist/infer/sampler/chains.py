@@ -181,7 +181,7 @@ class _History:
 
 
 def run_chains(density: Density, proposal: Proposal, settings: ChainSettings) -> Chains:
-    """Sample until the convergence criteria are met or the maximum number of steps is reached.
+    """Sample a density until the convergence criteria are met or the number of steps is exhausted.
 
     Raises DegenerateError if hardly any proposal is inside the support, and InputError if
     checkpoints cannot be read or written.
@@ -230,7 +230,7 @@ def pilot_of(target: Density, proposal: Proposal, s: ChainSettings) -> ProposalB
 
 
 def plan_of(target: Density, quality: Quality, s: ChainSettings) -> Plan:
-    """Choose the moves for a proposal of the given quality."""
+    """Choose the moves for a proposal of the given quality, from the settings `s` of the run."""
     q, n_proposals = quality, len(quality.log_weights) + quality.n_outside
     return plan_moves(q.efficiency, q.k, len(target.names), s.n_stars, s.walkers, n_proposals)
 

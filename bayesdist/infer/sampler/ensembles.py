@@ -70,7 +70,7 @@ class _Replay:
 
 
 def replay(start: Walkers, batch: ProposalBatch, ensemble: int) -> Block:
-    """Run Metropolis-Hastings steps over proposals that have already been evaluated.
+    """Run the Metropolis-Hastings steps of an ensemble over proposals that are already evaluated.
 
     The batch has proposals (ensembles, steps * walkers, D), ordered by step.
     """
@@ -162,8 +162,8 @@ class Ensembles:
     ) -> list[Block]:
         """Advance every ensemble from its state at `span.begin`, or read the block from a file.
 
-        `rest` are the pilot proposals that were not used as starting points; they are used for the
-        first steps.
+        `states` has the state of each ensemble.  `rest` are the pilot proposals that were not used
+        as starting points; they are used for the first steps.
         """
         paths: list[Path | None] = [None] * len(self.seeds)
         if self.folder is not None:

@@ -105,7 +105,7 @@ def pilot_batch(
 
     If `folder` is given, the densities are stored in a file and read from it by a resumed run; the
     proposals themselves are drawn again.  Raises InputError if the file cannot be read or written,
-    or belongs to other data or settings.
+    or belongs to other data or settings, that is, has another `fingerprint`.
     """
     path = None if folder is None else folder / "chain-0-pilot.h5"
     if path is not None and path.exists():

@@ -171,9 +171,9 @@ class StepRange:
 def block_schedule(pilot: int, every: int, max_steps: int, n_stars: int) -> Iterator[StepRange]:
     """Yield the blocks of steps for independence moves.
 
-    The pilot is divided into blocks of at most `every` steps.  Later blocks are 1/8 (expensive
-    passes) or 1/4 (cheap passes) of the number of steps so far, but at most `every`.  The schedule
-    does not depend on the convergence criteria.
+    The pilot, of `pilot` steps, is divided into blocks of at most `every` steps.  Later blocks are
+    1/8 (expensive passes) or 1/4 (cheap passes) of the number of steps so far, but at most `every`.
+    The schedule does not depend on the convergence criteria.
     """
     growth = 1 / 8 if n_stars > DEAR else 1 / 4
     begin = 0

@@ -488,7 +488,7 @@ def _gauge_at_start(
 def curvatures(
     problem: Problem, pieces: MappedPieces[of.StarPiece], theta: Float, mixture: Mixture
 ) -> tuple[Float, Float]:
-    """Curvatures (D, D) for the detections alone, and including the priors of the stars."""
+    """Curvatures (D, D) of the log density, without and with the priors of the stars."""
     informed = pieces.sum(of.expansion, theta, mixture, False, True).curvature
     if not problem.priors.informed.any():
         return informed, informed

@@ -255,7 +255,7 @@ class Problem:
         return replace(self, X=X, Y=Y, offset=offset, W=W)
 
     def of_stars(self, which: Int) -> Problem:
-        """Problem with a subset of the stars, given by ascending indices."""
+        """Problem with a subset of the stars, given by ascending indices `which`."""
         counts = self.counts[which]
         starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
         rows = np.repeat(self.starts[which] - starts[:-1], counts) + np.arange(starts[-1])

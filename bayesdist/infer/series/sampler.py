@@ -197,7 +197,10 @@ def starting_state(
 def warm_up(
     problem: SeriesProblem, n_chains: int, sweeps: int, rng: np.random.Generator
 ) -> tuple[Engine, State]:
-    """Run the warm-up; return the engine, with moves that are fixed from now on, and the state."""
+    """Run the warm-up of some chains; return the engine and the state.
+
+    The moves of the engine are fixed from now on.
+    """
     moves = BreakMoves(problem.design) if problem.design.trend.find else None
     state = starting_state(problem, moves, n_chains, rng)
     for t in range(sweeps):

@@ -74,7 +74,7 @@ def tangent_cards(
 ) -> list[str]:
     """Cards of the WCS of a tangent plane in degrees; `comment` explains the CTYPE.
 
-    `cd` (2, 2) is in degrees per pixel.
+    `crval` is in degrees, `crpix` in FITS 1-based pixels, and `cd` (2, 2) in degrees per pixel.
     """
     return [
         number_card("WCSAXES", 2),
@@ -102,7 +102,10 @@ def solution_cards(
     size: tuple[float, float],
     epoch: float | None = None,
 ) -> list[str]:
-    """Cards on plane, unit, chip, date and size, which a header in degrees does not state."""
+    """Cards on plane, unit, chip, date and size, which a header in degrees does not state.
+
+    `arcsec` is the size of the unit of u and v in arcsec, and `epoch` a decimal year.
+    """
     dated = [] if epoch is None else [("BDEPOCH", float(epoch), "[yr] date of the coefficients")]
     return [
         text_card("BDPLANE", plane, "plane of u, v"),

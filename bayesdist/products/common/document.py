@@ -65,7 +65,7 @@ DistortionReader = Callable[[fits.Header, str], DistortionText | None]
 
 
 def of_part(part: str, findings: Iterable[Finding]) -> list[Finding]:
-    """Findings with the name of the part of the file put first; unchanged if `part` is empty."""
+    """Add the name of the part of a file in front of each finding; unchanged if `part` is empty."""
     return [
         replace(finding, where=f"{part}, {finding.where}" if part else finding.where)
         for finding in findings

@@ -29,7 +29,7 @@ class HeaderText:
     findings: list[Finding] = field(default_factory=list)
 
     def add_finding(self, level: str, where: str, message: str) -> None:
-        """Add a finding."""
+        """Add a finding of a level, with its place and message."""
         self.findings.append(Finding(level, where, message))
 
 

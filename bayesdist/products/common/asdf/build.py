@@ -77,7 +77,7 @@ def chip_transforms(
 
 
 def refuse_larger(one: ChipTransform, name: str, known: Detector | None, where: str) -> None:
-    """Raise InputError if a chip has more pixels than the named detector."""
+    """Raise InputError if a chip has more pixels than the detector of this name, if it is known."""
     [chip] = one.calibration.model.chips
     if known is not None and any(a > b for a, b in zip(chip.size, known.size, strict=True)):
         (nx, ny), (most_x, most_y) = chip.size, known.size
