@@ -38,8 +38,9 @@ class UncertaintyMap:
     Parameters
     ----------
     x : ndarray, shape (nx,)
+        FITS 1-based columns.
     y : ndarray, shape (ny,)
-        FITS 1-based pixels.
+        FITS 1-based rows.
     sigma_u, sigma_v : ndarray, shape (ny, nx)
         Standard deviations in `unit`; NaN at positions outside the field that sees the sky.
     correlation : ndarray, shape (ny, nx)
@@ -285,8 +286,9 @@ class AreaMap:
     Parameters
     ----------
     x : ndarray, shape (nx,)
+        FITS 1-based columns.
     y : ndarray, shape (ny,)
-        FITS 1-based pixels.
+        FITS 1-based rows.
     area : ndarray, shape (ny, nx)
         ``|det d(u, v) / d(x, y)|`` divided by its value at the reference pixel.
     sigma : ndarray, shape (ny, nx)

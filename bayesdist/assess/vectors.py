@@ -29,8 +29,9 @@ class VectorMap:
     Parameters
     ----------
     x : ndarray, shape (nx,)
+        FITS 1-based columns.
     y : ndarray, shape (ny,)
-        FITS 1-based pixels.
+        FITS 1-based rows.
     du, dv : ndarray, shape (ny, nx)
         Displacement along u and v, in `unit`.
     unit : str

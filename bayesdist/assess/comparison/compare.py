@@ -58,8 +58,9 @@ class Comparison:
     frame : CommonFrame
         The difference A - B as a polynomial, and what was removed from it.
     x : ndarray, shape (nx,)
+        Columns of the grid, FITS 1-based pixels.
     y : ndarray, shape (ny,)
-        Grid, FITS 1-based pixels.
+        Rows of the grid, FITS 1-based pixels.
     du, dv : ndarray, shape (ny, nx)
         The difference along x and y.
     sigma_u, sigma_v, correlation : ndarray, shape (ny, nx), optional

@@ -307,6 +307,7 @@ class PeriodComparison:
         period, against
             See `difference`.
         rng : numpy.random.Generator
+            Random generator of the noise fields.
         grid : int
             Number of points along each axis, from edge to edge of the detector.
         n_draws : int
@@ -316,6 +317,11 @@ class PeriodComparison:
         Returns
         -------
         PositionChange
+
+        Raises
+        ------
+        InputError
+            See `difference`.
         """
         difference, cov = self.difference(period, against)
         return largest_difference(self.model, difference, cov, rng=rng, grid=grid, n_draws=n_draws)
@@ -342,6 +348,11 @@ class PeriodComparison:
         Returns
         -------
         DifferenceField
+
+        Raises
+        ------
+        InputError
+            See `difference`.
         """
         chip = chip or self.model.chips[0]
         return difference_field(self.model, *self.difference(period, against), chip, grid)

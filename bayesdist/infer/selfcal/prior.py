@@ -302,8 +302,9 @@ def start_parameters(
 ) -> Float:
     """Parameters (D,) from polynomials and the frames of the exposures relative to the first one.
 
-    Frames of the model may be simpler than the given ones; they agree at `middles` (E, 2), the
-    centre of the detections of each exposure on the plane of that exposure.
+    `coefficients` (chips, 2, K) are those of the polynomials.  Frames of the model may be simpler
+    than the given ones; they agree at `middles` (E, 2), the centre of the detections of each
+    exposure on the plane of that exposure.
     """
     theta = np.zeros(model.n_params)
     for chip, of_chip in zip(model.chips, coefficients, strict=True):
