@@ -87,7 +87,7 @@ class EvaluationSettings:
     field: Region = WHOLE
 
     def domain(self, errors: ErrorModel) -> EvaluationDomain:
-        """Grid points of all chips within the field."""
+        """Grid points within the field on all chips of the model of `errors`, at `self.epoch`."""
         model = errors.solution.solution.model
         return EvaluationDomain.of_chips(model, self.grid, epoch=self.epoch, region=self.field)
 

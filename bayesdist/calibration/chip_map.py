@@ -499,7 +499,7 @@ def scaled(rows: Sequence[FurtherError], factor: float) -> tuple[FurtherError, .
 
 
 def further_from(records: Sequence[Mapping[str, Any]], where: str) -> tuple[FurtherError, ...]:
-    """Rows from the records of a file; raises FormatError if a record is incomplete."""
+    """Error rows from the records of a file; raises FormatError if a record is incomplete."""
     try:
         return tuple(
             FurtherError(

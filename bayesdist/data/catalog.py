@@ -149,7 +149,7 @@ class ReferenceCatalog:
         return replace(self, **arrays, star=self.star[which])
 
     def by_code(self, *names: str) -> Float | None:
-        """Columns (codes, n) by the code of the star; None if the catalogue lacks any of them."""
+        """Columns (codes, n) of the catalogue, with a row per star code; None if any is missing."""
         out = np.zeros((int(self.star.max()) + 1, len(names)))
         for k, name in enumerate(names):
             values = getattr(self, name)

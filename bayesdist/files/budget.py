@@ -78,7 +78,7 @@ class Budget:
 
     @property
     def arrays(self) -> int:
-        """Largest size in bytes of images and other arrays that are no columns of stars."""
+        """Largest size in bytes of images and other arrays that are not columns of stars."""
         return max(self.content, min(memory_limit(), self.limits.arrays))
 
     @property

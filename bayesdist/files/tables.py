@@ -316,13 +316,13 @@ class VotableCheck:
         self._parser.CharacterDataHandler = scan.text
 
     def add(self, raw: bytes) -> None:
-        """Check the next bytes of the file."""
+        """Check the next bytes of the file; raises FormatError if they are unsafe or not XML."""
         for at in range(0, len(raw), _PIECE):
             self._parse(raw[at : at + _PIECE])
             self._clock()
 
     def end(self) -> None:
-        """Check that the file is complete."""
+        """Check that the file is complete; raises FormatError if it is not."""
         self._parse(b"", last=True)
 
     def _parse(self, raw: bytes, *, last: bool = False) -> None:

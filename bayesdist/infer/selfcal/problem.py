@@ -409,15 +409,9 @@ class TangentPlane:
     point: tuple[float, float] | None = None
 
     def contact(self, contacts: Float) -> Float:
-        """Tangent point (2,) of the common plane, from those (E, 2) of the exposures.
+        """Tangent point (2,) of the common plane, from the tangent points (E, 2) of the exposures.
 
-        Parameters
-        ----------
-        contacts : ndarray, shape (E, 2)
-
-        Returns
-        -------
-        ndarray, shape (2,)
+        Both are positions u, v.
         """
         return contacts.mean(axis=0) if self.point is None else np.asarray(self.point, float)
 
