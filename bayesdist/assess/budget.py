@@ -289,7 +289,7 @@ class ErrorBudget:
 
     @property
     def axes(self) -> tuple[Float, Float]:
-        """Columns (nx,) and rows (ny,) of the grid, for a budget over the grid of one chip."""
+        """Columns x (nx,) and rows y (ny,) of the grid of one chip, in FITS 1-based pixels."""
         if self.domain.grid is None:
             return self.x, self.y[:1]
         [number] = self.domain.chips

@@ -97,12 +97,13 @@ def estimate(
 ) -> MagnitudeErrors:
     """Standard errors by magnitude: smoothed robust scatter of residuals (N,) in magnitude bins.
 
-    The scatter of a bin is 1.4826 times the median absolute residual of the stars within 4 sigma on
-    both axes. It is taken about zero, because an offset common to the stars of one magnitude is
-    also an error. It is corrected for the size of the bin and for the degrees of freedom used by
-    the fit: `n_params` is the number of parameters, for both axes together, of a fit with weights 1
-    / sigma^2. Bins hold nearly equal numbers of stars. The smoothed curve increases towards faint
-    stars, and towards the brightest (saturated) stars if the data require it.
+    The errors have the unit of the residuals. The scatter of a bin is 1.4826 times the median
+    absolute residual of the stars within 4 sigma on both axes. It is taken about zero, because an
+    offset common to the stars of one magnitude is also an error. It is corrected for the size of
+    the bin and for the degrees of freedom used by the fit: `n_params` is the number of parameters,
+    for both axes together, of a fit with weights 1 / sigma^2. Bins hold nearly equal numbers of
+    stars. The smoothed curve increases towards faint stars, and towards the brightest (saturated)
+    stars if the data require it.
 
     Raises InputError if values are not finite, if there are fewer than 10 stars, if there are not
     more residuals than parameters, or if a bin has no scatter.

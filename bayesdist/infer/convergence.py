@@ -291,7 +291,8 @@ def rhat_and_bulk_draws(chains: Float, walkers: int = 1) -> Float:
 def tail_draws(chains: Float, tails: tuple[float, float]) -> Float:
     """Effective sample size (D,) of the tails of chains (C, N, D).
 
-    It is the smaller one of those of the two quantiles `tails`.
+    The effective sample size is computed for two quantiles, of probabilities `tails`; the smaller
+    value is returned.
     """
 
     def smaller(some: Float) -> Float:

@@ -26,6 +26,7 @@ def ascii_of(text: str) -> str:
     Parameters
     ----------
     text : str
+        Text with any characters.
 
     Returns
     -------

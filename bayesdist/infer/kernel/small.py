@@ -141,6 +141,7 @@ def densities(
     sigma : ndarray, shape (C, k, k)
         Intrinsic covariances. The covariance of a normal exposure is `formal` + `sigma`.
     residual : ndarray, shape (C, k, E)
+        Coefficients of the exposures minus the trend.
     fraction : ndarray, shape (C,)
         Fraction of outlying exposures.
     kappa2 : ndarray, shape (C,)
@@ -209,6 +210,7 @@ def draw_deviations(
     precision : ndarray, shape (C, k, k, E)
         Result of `precisions`.
     residual : ndarray, shape (C, k, E)
+        Coefficients of the exposures minus the trend.
     rng : numpy.random.Generator
 
     Returns
@@ -258,7 +260,9 @@ def gaussians(matrix: Float, right: Float, noise: Float) -> tuple[Float, Float]:
     Parameters
     ----------
     matrix : ndarray, shape (C, q, q)
+        Precision matrices.
     right : ndarray, shape (C, q)
+        Precision times mean.
     noise : ndarray, shape (C, q)
         Standard normal random numbers.
 
@@ -424,6 +428,7 @@ def shear(
     deviation : ndarray, shape (C, k, E)
         Intrinsic deviations of the exposures.
     residual : ndarray, shape (C, k, E)
+        Coefficients of the exposures minus the trend.
     inverse : ndarray, shape (k, k, E)
         Formal precision of the residuals.
     sigma : ndarray, shape (C, k, k)

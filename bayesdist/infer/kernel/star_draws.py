@@ -348,6 +348,7 @@ def log_marginals(
     coef : ndarray, shape (D, G, 2, K)
         Coefficients of the Legendre products.
     order : int
+        Total order of the polynomials.
     rows : ndarray, shape (D, 3)
         Squared jitter, log of the core fraction, log density of outliers.
     least : float

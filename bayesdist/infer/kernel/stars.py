@@ -291,6 +291,7 @@ def linearised(
     half : ndarray, shape (G, 2)
         Size in pixels of one unit of X and Y.
     order : int
+        Total order of the polynomials.
 
     Returns
     -------

@@ -265,6 +265,7 @@ def eliminate_stars(
     n_params : int
         Number D of model parameters.
     order : int
+        Total order of the polynomials.
     j2, log_core, log_out : float
         Squared jitter, log of the core fraction, log density of outliers.
     least : float

@@ -185,6 +185,7 @@ def fit_mixture(residual: Float, variance: Float) -> ResidualMixture:
     Parameters
     ----------
     residual : ndarray, shape (N, 2)
+        Residuals along both axes.
     variance : ndarray, shape (N, 2)
         Squares of the quoted errors.
 

@@ -164,7 +164,10 @@ class Problem:
         return np.array([self.model.basis(chip).half_size for chip in chips])
 
     def jacobians(self, theta: Float, rows: slice) -> Float:
-        """Derivatives (n, 2, 2) of sky positions with respect to pixels, for some detections."""
+        """Derivatives (n, 2, 2) of sky positions with respect to pixels, at parameters theta (D,).
+
+        `rows` is a slice with the n detections.
+        """
         g = self.groups.index[rows]
         with threads_for(len(g)):
             by = kernel.slopes(g, self.X[rows], self.Y[rows], self.powers(theta), self.model.order)

@@ -83,7 +83,10 @@ def packed(
 
 
 def tagged(node: Mapping[str, Any], tag: str, name: str) -> Any:
-    """Node with a tag that needs no converter; errors as for `packed`."""
+    """Node of an ASDF tree with a tag that needs no converter.
+
+    Raises InputError if asdf is not installed; `name` is the file for its message.
+    """
     asdf_with_transforms(name)
     from asdf.tagged import TaggedDict
 
