@@ -104,16 +104,7 @@ def plots_of_run(run: Run) -> RunPlots:
     """Plots of a run."""
     from bayesdist.report.run_plots import RunPlots  # matplotlib is only loaded for plots
 
-    return RunPlots(
-        fit=run.fit,
-        posterior=run.posterior,
-        diagnostics=run.diagnostics,
-        evaluation=run.evaluation,
-        solution=run.solution,
-        scale_mas=run.config.detector.scale_mas,
-        magnitude_errors=run.errors.by_magnitude,
-        rows=run.kind.rows,
-    )
+    return RunPlots(run)
 
 
 def wcs_of_run(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 from bayesdist.errors import InputError, require_known, required
 from bayesdist.report import plots
@@ -26,35 +26,65 @@ RESIDUAL_KINDS = ("position", "histogram", "magnitude", "x", "y", "colour", "epo
 MAPS = ("posterior", "formal", "relative")
 
 
+class WithMagnitudeErrors(Protocol):
+    """Errors that a fit assumed."""
+
+    @property
+    def by_magnitude(self) -> MagnitudeErrors | None:
+        """Errors by magnitude that were assigned to the stars; None if there are none."""
+
+
+class WithRows(Protocol):
+    """Kind of a run."""
+
+    @property
+    def rows(self) -> str:
+        """Word for the rows of the data in labels, such as 'stars' or 'detections'."""
+
+
+class PlottedRun(Protocol):
+    """What the plots read of a run; `bayesdist.Run` has more."""
+
+    @property
+    def fit(self) -> LinearFit:
+        """Least-squares fit."""
+
+    @property
+    def posterior(self) -> Posterior:
+        """Posterior as it was sampled."""
+
+    @property
+    def solution(self) -> Solution:
+        """Solution with the distortion to show."""
+
+    @property
+    def diagnostics(self) -> Diagnostics:
+        """Results of the tests of the residuals."""
+
+    @property
+    def evaluation(self) -> Evaluation:
+        """Maps, budget, margins and validity periods."""
+
+    @property
+    def errors(self) -> WithMagnitudeErrors:
+        """Errors that the fit assumed."""
+
+    @property
+    def kind(self) -> WithRows:
+        """Kind of the run."""
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class RunPlots:
     """Plots of a run. Each method draws into `ax`, or into a new figure, and returns the axes.
 
     Parameters
     ----------
-    fit : LinearFit
-    posterior : Posterior or None
-        None if nothing was sampled.
-    diagnostics : Diagnostics
-    evaluation : Evaluation
-    solution : LinearFit or Posterior, optional
-        Solution with the distortion to show; by default the posterior, or the fit if there is none.
-    scale_mas : float, optional
-        Size of a pixel in mas, for plots with ``mas=True``; that of the evaluation by default.
-    magnitude_errors : MagnitudeErrors, optional
-        Errors by magnitude that were assigned to the stars.
-    rows : str
-        Word for the rows of the data in labels, such as 'stars' or 'detections'.
+    run : PlottedRun
+        Run that was sampled; its artefacts are read when a plot needs them.
     """
 
-    fit: LinearFit
-    posterior: Posterior | None
-    diagnostics: Diagnostics
-    evaluation: Evaluation
-    solution: Solution | None = None
-    scale_mas: float | None = None
-    magnitude_errors: MagnitudeErrors | None = None
-    rows: str = "stars"
+    run: PlottedRun
 
     def __dir__(self) -> list[str]:
         """Names of the plots only, for completion in notebooks."""
@@ -100,7 +130,7 @@ class RunPlots:
         """
         require_known(which, MAPS, "map", where="which")
         of = {"posterior": "maps", "formal": "formal", "relative": "relative"}
-        maps = getattr(self.evaluation, of[which])
+        maps = getattr(self.run.evaluation, of[which])
         if not maps:
             raise InputError(
                 "relative positions are only evaluated in a self-calibration",
@@ -146,9 +176,9 @@ class RunPlots:
         """
         from bayesdist.assess.vectors import diagram_vectors
 
-        chosen = self.fit.model.chips[self._index(chip)]
-        epoch = self.evaluation.settings.epoch
-        vectors = diagram_vectors(self._shown, chosen, part=part, epoch=epoch)
+        chosen = self.run.fit.model.chips[self._index(chip)]
+        epoch = self.run.evaluation.settings.epoch
+        vectors = diagram_vectors(self.run.solution, chosen, part=part, epoch=epoch)
         options = {"name": self._name(chip)} | options
         return plots.plot_distortion(vectors, ax, scale_mas=self._scale(mas), **options)
 
@@ -188,18 +218,19 @@ class RunPlots:
             If the kind, axis or chip is unknown, or the stars do not have the quantity.
         """
         require_known(kind, RESIDUAL_KINDS, "kind of residuals", where="kind")
-        sample, unit = self.diagnostics.sample, self.fit.model.unit
+        run = self.run
+        sample, unit, rows = run.diagnostics.sample, run.fit.model.unit, run.kind.rows
         if kind == "position":
-            binned = self.diagnostics.shown[self._index(chip)].residuals()
+            binned = run.diagnostics.shown[self._index(chip)].residuals()
             options = {"unit": unit, "name": self._name(chip)} | options
             return plots.plot_residual_vectors(binned, ax, **options)
         if kind == "histogram":
-            options = {"fit": self.fit, "posterior": self.posterior, "rows": self.rows} | options
-            return plots.plot_residual_histogram(sample, ax, axis=axis, **options)
+            of_run: dict[str, Any] = {"fit": run.fit, "posterior": run.posterior, "rows": rows}
+            return plots.plot_residual_histogram(sample, ax, axis=axis, **of_run | options)
         if kind == "magnitude":
-            options = {"unit": unit, "errors": self.magnitude_errors, "rows": self.rows} | options
+            options = {"unit": unit, "errors": run.errors.by_magnitude, "rows": rows} | options
             return plots.plot_residual_density(sample, ax, axis=axis, **options)
-        solution = self.fit if self.posterior is None else self.posterior
+        solution = run.posterior
         return plots.plot_residual_means(sample, kind, ax, axis=axis, solution=solution, **options)
 
     def exposures(self, ax: Axes | None = None) -> Axes:
@@ -218,7 +249,7 @@ class RunPlots:
         InputError
             If the run has only one exposure.
         """
-        scatter = self.diagnostics.sample.by_exposure
+        scatter = self.run.diagnostics.sample.by_exposure
         return plots.plot_exposures(required(scatter, "the run has one exposure"), ax)
 
     def budget(
@@ -252,9 +283,9 @@ class RunPlots:
         """
         scale_mas = self._scale(mas)
         if chip is not None and self._several:
-            name = self.fit.model.chips[self._index(chip)].name
+            name = self.run.fit.model.chips[self._index(chip)].name
             options = {"over": name or f"chip {chip}"} | options
-        budget = self.evaluation.budget
+        budget = self.run.evaluation.budget
         return plots.plot_budget(budget, ax, chip=chip, scale_mas=scale_mas, **options)
 
     def margins(self, ax: Axes | None = None) -> Axes:
@@ -273,7 +304,7 @@ class RunPlots:
         InputError
             If no requirement was stated.
         """
-        return plots.plot_margins(self.evaluation.margins, ax)
+        return plots.plot_margins(self.run.evaluation.margins, ax)
 
     def validity(self, ax: Axes | None = None, *, requirement: str | None = None) -> Axes:
         """Plot the probability of meeting a requirement against time.
@@ -293,7 +324,7 @@ class RunPlots:
         InputError
             If the requirement is unknown, or the solution does not depend on time.
         """
-        periods = {period.requirement.name: period for period in self.evaluation.validity}
+        periods = {period.requirement.name: period for period in self.run.evaluation.validity}
         if not periods:
             raise InputError(
                 "the run has no validity period",
@@ -327,7 +358,7 @@ class RunPlots:
         InputError
             If a parameter is unknown, or nothing was sampled.
         """
-        return plots.plot_corner(self._sampled("corner"), parameters, fig=fig)
+        return plots.plot_corner(self.run.posterior, parameters, fig=fig)
 
     def correlations(self, ax: Axes | None = None) -> Axes:
         """Plot the correlations between the coefficients in the posterior.
@@ -345,7 +376,7 @@ class RunPlots:
         InputError
             If nothing was sampled.
         """
-        return plots.plot_correlations(self._sampled("correlations"), ax)
+        return plots.plot_correlations(self.run.posterior, ax)
 
     def ranks(self, ax: Axes | None = None, *, parameter: str | None = None) -> Axes:
         """Plot the ranks of the draws of each ensemble, which are flat if the ensembles agree.
@@ -365,18 +396,16 @@ class RunPlots:
         InputError
             If the parameter is unknown, or nothing was sampled.
         """
-        return plots.plot_ranks(self._sampled("ranks"), parameter, ax)
+        return plots.plot_ranks(self.run.posterior, parameter, ax)
 
     def __repr__(self) -> str:
         """Names of the plots that this run has, with a description of each."""
-        left_out = set()
-        if self.posterior is None:
-            left_out |= {"corner", "correlations", "ranks"}
-        if not self.evaluation.margins:
+        left_out: set[str] = set()
+        if not self.run.evaluation.margins:
             left_out.add("margins")
-        if not self.evaluation.validity:
+        if not self.run.evaluation.validity:
             left_out.add("validity")
-        if self.diagnostics.sample.by_exposure is None:
+        if self.run.diagnostics.sample.by_exposure is None:
             left_out.add("exposures")
         lines = []
         for name, method in vars(RunPlots).items():
@@ -387,37 +416,25 @@ class RunPlots:
 
     @property
     def _several(self) -> bool:
-        return len(self.fit.model.chips) > 1
-
-    @property
-    def _shown(self) -> Solution:
-        """Solution with the distortion to show."""
-        if self.solution is not None:
-            return self.solution
-        return self.fit if self.posterior is None else self.posterior
+        return len(self.run.fit.model.chips) > 1
 
     def _index(self, chip: int | None) -> int:
-        return 0 if chip is None else self.fit.model.chip_code(chip)
+        return 0 if chip is None else self.run.fit.model.chip_code(chip)
 
     def _name(self, chip: int | None) -> str:
         """Name of a chip for titles; empty if there is only one chip."""
-        chosen = self.fit.model.chips[self._index(chip)]
+        chosen = self.run.fit.model.chips[self._index(chip)]
         return (chosen.name or f"chip {chosen.number}") if self._several else ""
 
     def _scale(self, mas: bool) -> float | None:
         """Size of a pixel in mas if requested, else None."""
         if not mas:
             return None
-        scale_mas = self.evaluation.settings.scale_mas if self.scale_mas is None else self.scale_mas
-        if scale_mas is None and self.fit.model.unit == "pix":
+        scale_mas = self.run.evaluation.settings.scale_mas
+        if scale_mas is None and self.run.fit.model.unit == "pix":
             raise InputError(
                 "the size of a pixel is unknown",
                 where="plot",
                 do="give the run its pixel scale (detector.scale_mas), or plot pixels",
             )
         return scale_mas
-
-    def _sampled(self, name: str) -> Posterior:
-        if self.posterior is None:
-            raise InputError("nothing was sampled", where=f"plot.{name}", do="sample the posterior")
-        return self.posterior

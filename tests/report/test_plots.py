@@ -43,7 +43,7 @@ def run_plots(r, **parts) -> RunPlots:
     """Plots of a run, with what they take from its diagnostics and its evaluation."""
     shown = tuple(SimpleNamespace(residuals=lambda c=c: c.binned) for c in r.chips)
     evaluation = {
-        "settings": EvaluationSettings(epoch=2010.3),
+        "settings": EvaluationSettings(epoch=2010.3, scale_mas=SCALE),
         "formal": tuple(c.formal_map for c in r.chips),
         "maps": tuple(c.posterior_map for c in r.chips),
         "relative": (),
@@ -51,14 +51,16 @@ def run_plots(r, **parts) -> RunPlots:
         "margins": r.margins,
         "validity": (),
     }
-    return RunPlots(
+    run = SimpleNamespace(
         fit=r.fit,
         posterior=r.posterior,
+        solution=r.posterior,
         diagnostics=SimpleNamespace(sample=r.stars, shown=shown),
         evaluation=SimpleNamespace(**evaluation | parts),
-        scale_mas=SCALE,
-        magnitude_errors=r.magnitude_errors,
+        errors=SimpleNamespace(by_magnitude=r.magnitude_errors),
+        kind=SimpleNamespace(rows="stars"),
     )
+    return RunPlots(run)
 
 
 @pytest.fixture(scope="module")
@@ -431,20 +433,16 @@ def test_wrong_input_is_named(plot, converged):
         plot.corner(["u_9_9"], fig=Figure())
     with pytest.raises(InputError, match="give a list of names"):
         plot.corner("u_1_0", fig=Figure())
-    unsampled = run_plots(report_input(sampler=False))
-    with pytest.raises(InputError, match="nothing was sampled"):
-        unsampled.corner(fig=Figure())
-    unscaled = RunPlots(converged.fit, None, plot.diagnostics, plot.evaluation)
+    unscaled = run_plots(converged, settings=EvaluationSettings(epoch=2010.3))
     with pytest.raises(InputError, match="the size of a pixel is unknown"):
         unscaled.map(Figure().subplots(), mas=True)
 
 
-def test_the_plots_of_a_run_are_listed(plot):
+def test_the_plots_of_a_run_are_listed(plot, converged):
     listed = re.findall(r"^  \.(\w+)\(\)", repr(plot), re.MULTILINE)
     assert {"map", "distortion", "residuals", "budget", "margins", "corner"} <= set(listed)
     assert "validity" not in listed and all(hasattr(plot, name) for name in listed)
-    unsampled = repr(run_plots(report_input(sampler=False), margins=()))
-    assert "corner" not in unsampled and "margins" not in unsampled
+    assert "margins" not in repr(run_plots(converged, margins=()))
 
 
 def test_probabilities_over_time_are_those_of_the_report(converged):
