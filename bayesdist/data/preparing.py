@@ -165,9 +165,9 @@ def centroid_errors(table: Matches, total: MagnitudeErrors) -> MagnitudeErrors:
 def neutralise_aberration(table: Matches, log: ExposureLog) -> Matches:
     """Matches with catalogue positions converted to a scale free of velocity aberration.
 
-    A true offset on the sky is the factor times the offset in the aberration-free scale of the
-    detector. Positions and their errors are therefore divided by it. Another origin would
-    shift all stars of an exposure equally.
+    In an exposure with the factor a of velocity aberration, a true offset on the sky is a times the
+    offset in the aberration-free scale of the detector. Positions, relative to u = v = 0, and their
+    errors are therefore divided by a. Another origin would shift all stars of an exposure equally.
 
     Parameters
     ----------

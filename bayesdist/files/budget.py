@@ -58,6 +58,7 @@ class Budget:
     size : int
         Size of the file on disk, before decompression, in bytes.
     limits : Limits, optional
+        Limits that apply to files of any format; `LIMITS` by default.
     """
 
     where: str

@@ -124,8 +124,9 @@ def chance_rate(points: Float, tree: cKDTree, radius: float | Float, step: float
     """Fraction of points (N, 2) that find a neighbour by chance, measured by displacing them.
 
     Unlike a formula with a mean density, this accounts for gradients and clusters. `radius`, one
-    number or (N,), is the largest distance of a neighbour. `step` is the displacement in eight
-    directions, which must be large enough to exclude true pairs.
+    number or (N,), is the largest distance of a neighbour. `tree` is the k-d tree of the possible
+    neighbours. `step` is the displacement in eight directions, which must be large enough to
+    exclude true pairs.
     """
     stride = -(-len(points) * len(_DIRECTIONS) // _MAX_PROBES)
     sample = points[::stride]

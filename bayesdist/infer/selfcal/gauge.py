@@ -50,6 +50,7 @@ class NamedDirection:
         A key of `GENERATORS` (relative changes); 'zero_point_u', 'zero_point_v'; or a property of
         another chip relative to the first one, such as 'WFC1.shift_u' or 'WFC1.rotation'.
     unit : str
+        Unit of the property; empty for relative changes, and for rotations in radians.
     sigma : float
         Error from the detections alone; infinite if they do not determine it.
     sigma_fixed : float
