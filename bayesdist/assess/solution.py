@@ -34,7 +34,7 @@ class Place:
 
     @property
     def chip(self) -> Chip:
-        """The chip of the group."""
+        """Chip of this place."""
         return self.model.chips[int(self.group.chip[0])]
 
     @property

@@ -83,7 +83,7 @@ class Monitored:
 
     @property
     def verdict(self) -> str:
-        """Verdict in one sentence."""
+        """Sentence that says whether the released solution still describes the new matches."""
         m, late = self.worst, self.since_a_date
         test = self.date.change.test if late and self.date is not None else self.change.test
         x, y = m.position_of_largest

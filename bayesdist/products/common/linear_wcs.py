@@ -58,7 +58,7 @@ def finite_number(
 ) -> float:
     """Value of a keyword, or the default.
 
-    Raises FormatError if the keyword is missing and has no default, or if its value is no finite
+    Raises FormatError if the keyword is missing and has no default, or if its value is not a finite
     number.
     """
     value = header.get(keyword, default)
