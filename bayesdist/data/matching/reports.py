@@ -148,7 +148,7 @@ def all_cut(stars: Detections, rejected: Mapping[str, int]) -> InputError:
 
 
 def too_many(failed: int, matched: int, n: int) -> bool:
-    """True if so many exposures failed that the campaign must be misconfigured.
+    """True if too many exposures failed, which shows that the campaign is misconfigured.
 
     `failed` and `matched` count the exposures so far, and n is the number of all exposures.
     """
