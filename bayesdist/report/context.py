@@ -370,7 +370,6 @@ class CampaignResults:
     """Additional results of a campaign."""
 
     summary: Mapping[str, Any]  # as in summary.json
-    config: Mapping[str, Any]  # resolved configuration
     filter: str
     matching: Table  # content of matching.ecsv
     chips: tuple[Chip, ...]  # in the order of the model
@@ -380,7 +379,6 @@ class CampaignResults:
     detections: Detections | None = None
     footprints: Footprints | None = None
     residuals: tuple[ChipResiduals, ...] = ()
-    tables: tuple[LookupTable, ...] = field(default=())
     series: LinearSeries | None = None
     overlap: OverlapTest | None = None
 
@@ -388,11 +386,6 @@ class CampaignResults:
         """Section of summary.json; empty if there is none."""
         part: Mapping[str, Any] = self.summary.get(name) or {}
         return part
-
-    @property
-    def table_filters(self) -> tuple[str, ...]:
-        """Filters of the tables in order; '' for the tables of the detector."""
-        return tuple(dict.fromkeys(table.filter for table in self.tables))
 
     def chip_name(self, number: int) -> str:
         """Name of a chip."""

@@ -206,7 +206,6 @@ def results(chips, **changes) -> CampaignResults:
     width = 0.01 * 10 ** (0.1 * (grid + 14))
     base = CampaignResults(
         summary=summary(),
-        config={"products": {"release": {"period": [{"name": "pre", "years": [2002, 2009.4]}]}}},
         filter="F606W",
         matching=matching,
         chips=tuple(chips),
@@ -222,7 +221,6 @@ def results(chips, **changes) -> CampaignResults:
             "pix",
         ),
         residuals=tuple(residuals_of(chip) for chip in chips),
-        tables=tuple(pattern(chip.number) for chip in chips),
         series=series,
         overlap=overlap(),
     )
@@ -233,5 +231,12 @@ def results(chips, **changes) -> CampaignResults:
 def campaign_input() -> ReportInput:
     """A run of two chips with what a campaign adds."""
     run = report_input(size=SIZE, names=NAMES)
-    campaign = results([c.chip for c in run.chips])
-    return replace(run, campaign=campaign, tables=campaign.tables, words=PAIRED)
+    chips = [c.chip for c in run.chips]
+    release = {"period": [{"name": "pre", "years": [2002, 2009.4]}]}
+    return replace(
+        run,
+        config={**run.config, "products": {"release": release}},
+        campaign=results(chips),
+        tables=tuple(pattern(chip.number) for chip in chips),
+        words=PAIRED,
+    )

@@ -269,7 +269,7 @@ def _believed(table):
 def test_tables_of_a_filter_have_figures_of_their_own(run):
     chips = run.campaign.chips
     both = tuple(campaigns.pattern(c.number, f) for f in ("", "F814W") for c in chips)
-    changed = replace(run, campaign=replace(run.campaign, tables=both), tables=both)
+    changed = replace(run, tables=both)
     names = {"table_nodes", "table_nodes_F814W", "table_errors_F814W", "residuals_without_tables"}
     plan = plots_of(changed, *names)
     assert set(plan) == names
@@ -283,7 +283,7 @@ def test_a_campaign_without_tables_drift_and_overlap(run):
     one = run.campaign.residuals
     plain = tuple(replace(c, with_tables=None, binned_with=None) for c in one)
     less = replace(
-        run.campaign, summary=bare | {"tables": {"method": "none"}}, tables=(), residuals=plain,
+        run.campaign, summary=bare | {"tables": {"method": "none"}}, residuals=plain,
         series=None, overlap=None, catalog=None, detections=None,
     )  # fmt: skip
     small = replace(run, campaign=less, tables=())

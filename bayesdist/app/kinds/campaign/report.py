@@ -10,7 +10,6 @@ from astropy.table import Table
 from bayesdist.app.kinds.campaign.inputs import Inputs
 from bayesdist.app.kinds.campaign.matched import affine_model_of, is_mirrored
 from bayesdist.app.run import Run
-from bayesdist.app.store import as_json
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data.preparing import motion_error_line
 from bayesdist.diagnose.residuals.binned import binned_residuals
@@ -45,7 +44,6 @@ def report_fields(run: Run) -> dict[str, Any]:
     matching = read_ecsv(directory / "matching.ecsv")
     results = CampaignResults(
         summary=dict(directory.summary),
-        config=as_json(run.config.model_dump(exclude_none=True)),
         filter=inputs.filter,
         matching=matching,
         chips=tuple(posterior.model.chips),
@@ -55,7 +53,6 @@ def report_fields(run: Run) -> dict[str, Any]:
         detections=_detections(inputs),
         footprints=_footprints(posterior, inputs, is_mirrored(run.match_facts)),
         residuals=_residuals(run),
-        tables=run.tables.tables,
         series=_series(directory, run.model, matching),
         overlap=run.diagnostics.overlap,
     )

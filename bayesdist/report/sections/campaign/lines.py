@@ -25,7 +25,7 @@ def time_tables(r: ReportInput) -> Iterator[TextTable]:
     c = needed(r.campaign)
     section, joint = c.section("time_dependence"), c.summary.get("lines") or []
     names = {chip.number: chip.name for chip in c.chips}
-    published = published_terms(c.config, c.filter, tuple(names.values()))
+    published = published_terms(r.config, c.filter, tuple(names.values()))
     if c.section("gauge"):
         yield _gauge(c)
     terms = dict.fromkeys(row["term"] for row in joint)

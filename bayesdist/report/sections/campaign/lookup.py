@@ -11,7 +11,7 @@ from matplotlib.colors import Normalize
 
 from bayesdist.model import LookupTable
 from bayesdist.report.contents import REPORT, Plot
-from bayesdist.report.context import CampaignResults, ChipResiduals, ReportInput, needed
+from bayesdist.report.context import ChipResiduals, ReportInput, needed
 from bayesdist.report.figures.arrows import Arrows, magnification_of, spacing, vector_map
 from bayesdist.report.figures.fields import Grid, scalar_map
 from bayesdist.report.figures.panels import ChipPanels
@@ -63,7 +63,7 @@ def lookup_table(r: ReportInput) -> TextTable:
     return tabulated(caption, rows, words=(0, 1), note=note)
 
 
-@REPORT.figure("campaign-tables", needs=("campaign.residuals", "campaign.tables"))
+@REPORT.figure("campaign-tables", needs=("campaign.residuals", "tables"))
 def table_residuals(r: ReportInput) -> Plot:
     """Residuals of single stars on each chip, without the tables and with them.
 
@@ -116,7 +116,7 @@ def table_residuals(r: ReportInput) -> Plot:
     )
     return Plot(
         fig,
-        f"Residuals {_base(results)} and with all look-up tables",
+        f"Residuals {_base(r)} and with all look-up tables",
         text,
         "Clouds of residuals of each chip, narrower with the tables than before, and histograms.",
     )
@@ -131,9 +131,14 @@ def _cloud(ax: Axes, residual: Float, reach: float, color: str) -> None:
     ax.set_box_aspect(1)
 
 
-def _base(c: CampaignResults) -> str:
+def _base(r: ReportInput) -> str:
     """Clause on the fit with which residuals with tables are compared."""
-    return "with the detector's tables alone" if any(c.table_filters) else "without"
+    return "with the detector's tables alone" if _has_filter(r) else "without"
+
+
+def _has_filter(r: ReportInput) -> bool:
+    """True if the run fitted tables of a filter to those of the detector."""
+    return any(table.filter for table in r.tables)
 
 
 @REPORT.figure(
@@ -141,7 +146,7 @@ def _base(c: CampaignResults) -> str:
     needs=("campaign.residuals",),
     each=lambda r: {
         f"residuals_{which}_tables": which
-        for which in ("without", *(("with",) if r.campaign.tables else ()))
+        for which in ("without", *(("with",) if r.tables else ()))
     },
 )
 def residual_map(r: ReportInput, which: str) -> Plot:
@@ -174,8 +179,8 @@ def residual_map(r: ReportInput, which: str) -> Plot:
     )
     if which == "without":
         text += " What stands out repeats in all exposures."
-        alone = any(c.table_filters)
-        title = f"Residuals over the detector, {_base(c)}{'' if alone else ' tables'}"
+        alone = _has_filter(r)
+        title = f"Residuals over the detector, {_base(r)}{'' if alone else ' tables'}"
     else:
         if mean < noise:
             text += " It is less, because the tables follow these very stars."
@@ -216,26 +221,26 @@ def rms_of_cells(*binned: BinnedResiduals) -> tuple[float, float]:
 
 def _figures_by_filter(r: ReportInput, name: str, *, known: bool) -> Mapping[str, str]:
     """Names of figures by filter ('' for the detector); with `known`, only with known errors."""
-    tables = [t for t in needed(r.campaign).tables if t.sigma is not None or not known]
+    tables = [t for t in r.tables if t.sigma is not None or not known]
     return {f"{name}_{t.filter}" if t.filter else name: t.filter for t in tables}
 
 
-def _by_chip(c: CampaignResults, filter: str) -> list[LookupTable | None]:
+def _by_chip(r: ReportInput, filter: str) -> list[LookupTable | None]:
     """Table of each chip; None for chips without a table."""
-    of = {table.chip: table for table in c.tables if table.filter == filter}
-    return [of.get(chip.number) for chip in c.chips]
+    of = {table.chip: table for table in r.tables if table.filter == filter}
+    return [of.get(c.chip.number) for c in r.chips]
 
 
 @REPORT.figure(
     "campaign-tables",
-    needs=("campaign.tables",),
+    needs=("campaign", "tables"),
     each=lambda r: _figures_by_filter(r, "table_nodes", known=False),
 )
 def table_nodes(r: ReportInput, filter: str) -> Plot:
     """Shifts of the pixels by the tables of a filter, an arrow at each node."""
     c = needed(r.campaign)
-    chips = _by_chip(c, filter)
-    tables = [t for t in c.tables if t.filter == filter]
+    chips = _by_chip(r, filter)
+    tables = [t for t in r.tables if t.filter == filter]
     length = np.concatenate([np.hypot(*t.values).ravel() for t in tables])
     panels = ChipPanels(r.mosaic)
     panels.frame(0.03 * r.mosaic.longest_side)
@@ -277,14 +282,14 @@ def table_nodes(r: ReportInput, filter: str) -> Plot:
 
 @REPORT.figure(
     "campaign-tables",
-    needs=("campaign.tables",),
+    needs=("campaign", "tables"),
     each=lambda r: _figures_by_filter(r, "table_errors", known=True),
 )
 def table_errors(r: ReportInput, filter: str) -> Plot:
     """Standard errors of the nodes along x and y, in one scale of colours."""
     c = needed(r.campaign)
-    chips = _by_chip(c, filter)
-    tables = [t for t in c.tables if t.filter == filter]
+    chips = _by_chip(r, filter)
+    tables = [t for t in r.tables if t.filter == filter]
     errors = np.concatenate([t.sigma.ravel() for t in tables if t.sigma is not None])
     # a few nodes without stars must not dominate the colour scale
     low, high = float(errors.min()), float(np.quantile(errors, 0.995))

@@ -28,7 +28,7 @@ def released_files(r: ReportInput) -> TextTable | None:
     files = [p for p in c.summary.get("products") or () if p["kind"] in kinds]
     if not files:
         return None
-    release = c.config.get("products", {}).get("release") or {}
+    release = r.config.get("products", {}).get("release") or {}
     years = {p["name"]: p["years"] for p in release.get("period", ())}
     rows = []
     for p in files:
