@@ -39,7 +39,8 @@ POSITIONS = ("x", "y", "u", "v")
 SIGMAS = ("sigma_u", "sigma_v")
 _NOMINAL = ("u_nominal", "v_nominal")
 _MOTIONS = ("pm_u", "pm_v", "sigma_pm_u", "sigma_pm_v")
-OPTIONAL = ("epoch", "mag", "colour", *_NOMINAL, *_MOTIONS)
+CORRELATION = "rho_uv"
+OPTIONAL = (CORRELATION, "epoch", "mag", "colour", *_NOMINAL, *_MOTIONS)
 _INTEGERS = ("row", "source", "star", *LABELS_OF_CODES)
 _NUMBERS = (*POSITIONS, *SIGMAS, *OPTIONAL)
 COLUMNS = (*_NUMBERS, *_INTEGERS)
@@ -155,6 +156,7 @@ class MatchColumns:
     chip_names: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     match_radius: float | None = None
+    rho_uv: Float | None = None
 
     def _complete(self) -> None:
         """Fill in the defaults, convert every array to its type, and check the values."""
@@ -310,6 +312,16 @@ def _check(
     """Raise InputError for an unknown unit, half a pair, codes without labels, or bad values."""
     check_unit(unit, where=where)
     refuse_half(SIGMAS, columns, where=where, what="errors")
+    if CORRELATION in columns:
+        beyond = ~(np.abs(columns[CORRELATION]) < 1.0)
+        if beyond.any() or SIGMAS[0] not in columns:
+            raise InputError(
+                "correlations of errors must lie between -1 and 1"
+                if beyond.any()
+                else "correlations of errors are given, and the errors are not",
+                where=place(int(np.argmax(beyond)), CORRELATION),
+                do="correct them, or leave the column out",
+            )
     refuse_half(_NOMINAL, columns, where=where, what="nominal positions")
     for name, names in labels.items():
         if name != "source":  # file names may contain any character

@@ -73,6 +73,8 @@ class Matches(MatchColumns):
         Reference position, in `unit`.
     sigma_u, sigma_v : ndarray, optional
         Standard errors of the match in `unit`: both or neither. None if they are to be estimated.
+    rho_uv : ndarray, optional
+        Correlation of the errors in u and in v, between -1 and 1 (both excluded); 0 by default.
     unit : str
         'pix', 'arcsec', 'mas' or 'deg'.
     epoch : ndarray, optional
@@ -837,9 +839,12 @@ class Matches(MatchColumns):
             step = partial(Matches.with_errors, errors=errors, in_quadrature=in_quadrature)
             return self.mapped(step, adds=SIGMAS)
         sigma_u, sigma_v = self._errors(errors)
+        rho = None
         if in_quadrature and self.sigma_u is not None and self.sigma_v is not None:
             sigma_u, sigma_v = np.hypot(sigma_u, self.sigma_u), np.hypot(sigma_v, self.sigma_v)
-        return self.with_columns(sigma_u=sigma_u, sigma_v=sigma_v)
+            if self.rho_uv is not None:
+                rho = self.rho_uv * (self.sigma_u / sigma_u) * (self.sigma_v / sigma_v)
+        return self.with_columns(sigma_u=sigma_u, sigma_v=sigma_v, rho_uv=rho)
 
     def _errors(self, errors: Errors) -> tuple[Float, Float]:
         """Errors (N,) of u and of v."""

@@ -25,6 +25,7 @@ Calabretta & Greisen 2002, A&A 395, 1077, Section 5.1.3, written as standard coo
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import combinations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -41,10 +42,15 @@ if TYPE_CHECKING:
 
 MOTIONS = ("pm_ra", "pm_dec", "sigma_pm_ra", "sigma_pm_dec")
 # quantities that may be missing for a star, which then count as zero
-SPARED = ("parallax", "sigma_parallax", "corr_ra", "corr_dec")
+# pairs of the five astrometric parameters, in the order of the rows of their covariance
+PARAMETERS = ("ra", "dec", "parallax", "pm_ra", "pm_dec")
+CORRELATIONS = frozenset(f"corr_{first}_{second}" for first, second in combinations(PARAMETERS, 2))
+SPARED = ("parallax", "sigma_parallax", *sorted(CORRELATIONS))
 SKY_QUANTITIES = ("sigma_ra", "sigma_dec", *MOTIONS, *SPARED, "catalogue_epoch")
 # parsecs; without a radial velocity, the path on the sky does not depend on the distance
 _NO_MATTER = 100
+ROUNDED = 1e-5  # of correlations with few digits: the smallest eigenvalue may be below zero
+LARGEST_RHO = 1 - 1e-6  # of errors that one parameter dominates
 _STANDS = 1e-3  # years; over a shorter time motions are negligible
 _LIGHT = 299_792.458  # km/s
 ARCSEC = np.degrees(1.0) * 3600.0  # seconds of arc in a radian
@@ -57,6 +63,7 @@ class ReferenceSky:
     ra: Float  # (N,), degrees
     dec: Float  # (N,), degrees
     sigma: Float | None  # (2, N), along east and north, arcsec
+    rho: Float | None  # (N,) correlation of both errors; None if no correlations are known
     motion: Float | None  # (2, N), to east (with cos(dec)) and north, arcsec/yr
     sigma_motion: Float | None  # (2, N), errors of the motions
     notes: tuple[str, ...]  # clauses on how the positions were treated
@@ -108,13 +115,14 @@ def reference_sky(
     """Reference positions at `epoch`, with errors and motions if the table has them.
 
     `epoch` (N,) is the epoch of the exposures, and `catalogue_epoch` that of the reference
-    positions, used if the table has no such column; both are decimal years. Besides ra and dec,
-    these columns are used if they exist: sigma_ra, sigma_dec, pm_ra, pm_dec and their errors,
-    corr_ra and corr_dec (correlation of position and motion on one axis), parallax and its error.
-    Raises InputError for half a pair, and for missing or invalid units.
+    positions, used if the table has no such column; both are decimal years. Besides ra and dec, these columns are used if they exist: sigma_ra, sigma_dec,
+    pm_ra, pm_dec and their errors, parallax and its error, and the correlations of all these
+    (`CORRELATIONS`). Raises InputError for half a pair, and for missing or invalid units.
     """
     ra, dec = sky_columns(quantities)
-    sigma = _pair(quantities, ("sigma_ra", "sigma_dec"), "arcsec")
+    _pair(quantities, ("sigma_ra", "sigma_dec"), "arcsec")
+    covariance = _covariance(quantities)
+    sigma, rho = _errors_at(covariance, 0.0, 0.0)
     if "catalogue_epoch" in quantities:
         start: Float | None = quantities["catalogue_epoch"].years()
     else:
@@ -122,7 +130,7 @@ def reference_sky(
     moves = epoch is not None and start is not None
     motion = _pair(quantities, ("pm_ra", "pm_dec"), "arcsec / yr", missing=not moves)
     if motion is None:
-        return ReferenceSky(ra, dec, sigma, None, None, ())
+        return ReferenceSky(ra, dec, sigma, rho, None, None, ())
     sigma_motion = _pair(
         quantities, ("sigma_pm_ra", "sigma_pm_dec"), "arcsec / yr", missing=not moves
     )
@@ -130,7 +138,7 @@ def reference_sky(
         lacks = "the epoch of the exposures" if epoch is None else "the epoch of the catalogue"
         key = "data.epoch" if epoch is None else "data.catalogue_epoch"
         note = f"proper motions are not used: {lacks} is not given ({key})"
-        return ReferenceSky(ra, dec, sigma, motion, sigma_motion, (note,))
+        return ReferenceSky(ra, dec, sigma, rho, motion, sigma_motion, (note,))
     zero = zero_motions(quantities["pm_ra"].values, quantities["pm_dec"].values)
     if zero.any():  # tables on disk: rows are not left out in reading
         raise quantities["pm_ra"].fail(
@@ -146,20 +154,19 @@ def reference_sky(
         factors = _factors(epoch, mean_direction(ra, dec))
         new_ra = new_ra + parallax * factors[0] / 3600 / np.cos(np.radians(new_dec))
         new_dec = new_dec + parallax * factors[1] / 3600
-    if sigma is not None:
-        sigma = _sigma_at(quantities, sigma, sigma_motion, dt, factors)
+    sigma, rho = _errors_at(covariance, dt, factors)
     step = np.hypot(*motion) * np.abs(dt)
     first, last = float(epoch.min()), float(epoch.max())
     to = f"{first:.2f}" + (f" to {last:.2f}" if last - first > 0.005 else "")
     if not np.any(step) and parallax is None:
         note = "positions are of the exposures' epoch"
-        return ReferenceSky(ra, dec, sigma, motion, sigma_motion, (note,))
+        return ReferenceSky(ra, dec, sigma, rho, motion, sigma_motion, (note,))
     note = (
         f"positions of {np.median(start):.2f} were moved to {to} by proper motions"
         f"{'' if parallax is None else ' and parallaxes'} (median {np.median(step):.2g}, "
         f"at most {step.max():.2g} arcsec)"
     )
-    return ReferenceSky(new_ra, new_dec, sigma, motion, sigma_motion, (note,))
+    return ReferenceSky(new_ra, new_dec, sigma, rho, motion, sigma_motion, (note,))
 
 
 def _pair(
@@ -226,21 +233,60 @@ def _factors(epoch: Float, direction: tuple[float, float]) -> Float:
     return np.asarray(parallax_factors(dates, *direction)[of].T, float)
 
 
-def _sigma_at(
-    quantities: Quantities, sigma: Float, sigma_pm: Float | None, dt: Float, factors: Float
-) -> Float:
-    """Errors (2, N) at the new epoch, including those of motion and parallax."""
-    variance = sigma**2
-    if sigma_pm is not None:
-        for axis, key in enumerate(("corr_ra", "corr_dec")):
-            rho = _optional(quantities, key, "")
-            if rho is not None:
-                variance[axis] += 2 * np.clip(rho, -1, 1) * sigma[axis] * sigma_pm[axis] * dt
-        variance = variance + (sigma_pm * dt) ** 2
-    sigma_parallax = _optional(quantities, "sigma_parallax", "arcsec")
-    if sigma_parallax is not None:
-        variance = variance + (factors * sigma_parallax) ** 2
-    return np.sqrt(np.maximum(variance, np.finfo(float).tiny))
+def _covariance(quantities: Quantities) -> Float | None:
+    """Covariances (N, 5, 5) of `PARAMETERS` in arcsec and years; None without errors of positions.
+
+    Missing errors of parallaxes and motions, and missing correlations, count as zero.  InputError
+    for correlations that no covariance has.
+    """
+    if "sigma_ra" not in quantities:
+        return None
+    sigma = np.zeros((len(PARAMETERS), len(quantities)))
+    for k, name in enumerate(PARAMETERS):
+        unit = "arcsec / yr" if name.startswith("pm_") else "arcsec"
+        values = _optional(quantities, f"sigma_{name}", unit)
+        sigma[k] = 0.0 if values is None else values
+    out = np.zeros((len(quantities), len(PARAMETERS), len(PARAMETERS)))
+    out[:] = np.eye(len(PARAMETERS))
+    given = ""
+    for (i, first), (j, second) in combinations(enumerate(PARAMETERS), 2):
+        key = f"corr_{first}_{second}"
+        rho = _optional(quantities, key, "")
+        if rho is None:
+            continue
+        beyond = np.abs(rho) > 1.0
+        if beyond.any():
+            bad = int(np.argmax(beyond))
+            raise quantities[key].fail(bad, f"a correlation is {rho[bad]:g}, and is 1 at most")
+        out[:, i, j] = out[:, j, i] = rho
+        given = key
+    if given:
+        negative = np.linalg.eigvalsh(out)[:, 0] < -ROUNDED
+        if negative.any():
+            raise quantities[given].fail(
+                int(np.argmax(negative)), "the correlations of this star contradict each other"
+            )
+    return np.asarray(out * np.einsum("in,jn->nij", sigma, sigma))
+
+
+def _errors_at(
+    covariance: Float | None, dt: Float | float, factors: Float | float
+) -> tuple[Float | None, Float | None]:
+    """Errors (2, N) of positions after dt years, and their correlation (N,); None if unknown.
+
+    `covariance` is that of `_covariance`, and `factors` (2, N) are the parallax factors.
+    """
+    if covariance is None:
+        return None, None
+    A = np.zeros((len(covariance), 2, len(PARAMETERS)))
+    A[:, 0, 0] = A[:, 1, 1] = 1.0
+    A[:, :, 2] = np.transpose(np.broadcast_to(factors, (2, len(covariance))))
+    A[:, 0, 3] = A[:, 1, 4] = dt
+    C = A @ covariance @ np.swapaxes(A, 1, 2)
+    sigma = np.sqrt(np.maximum(np.stack([C[:, 0, 0], C[:, 1, 1]]), np.finfo(float).tiny))
+    if not C[:, 0, 1].any():
+        return sigma, None
+    return sigma, np.clip(C[:, 0, 1] / (sigma[0] * sigma[1]), -LARGEST_RHO, LARGEST_RHO)
 
 
 def velocity_aberration(
@@ -457,6 +503,7 @@ def onto_plane(
     point: tuple[float, float] | None,
     *,
     sigma: Float | None = None,
+    rho: Float | None = None,
     motion: Float | None = None,
     sigma_motion: Float | None = None,
     where: str = "",
@@ -464,10 +511,10 @@ def onto_plane(
 ) -> dict[str, Any]:
     """Arguments of `Matches` for stars on a tangent plane, in arcsec.
 
-    They are u, v and tangent_point, and the columns sigma, pm and sigma_pm for u and v if these are
-    given.  `ra`, `dec` (N,) and `point` are in degrees; the default point is the mean direction.
-    Errors, motions and their errors (2, N) are to the east (with the factor cos(dec)) and to the
-    north, in arcsec (per year).
+    They are u, v and tangent_point, rho_uv, and the columns sigma, pm and sigma_pm for u and v if
+    these are given.  `ra`, `dec` (N,) and `point` are in degrees; the default point is the mean direction. Errors,
+    motions and their errors (2, N) are to the east (with the factor cos(dec)) and to the north, in
+    arcsec (per year); `rho` (N,) is the correlation of the errors of positions.
     """
     point = mean_direction(ra, dec) if point is None else point
     u, v = tangent_plane(ra, dec, point, where=where, place=place)
@@ -480,7 +527,15 @@ def onto_plane(
     for name, errors in (("sigma", sigma), ("sigma_pm", sigma_motion)):
         if errors is not None:
             variance = np.einsum("nij,jn->in", J**2, errors**2)
+            if name == "sigma" and rho is not None:
+                mixed = 2 * rho * errors[0] * errors[1]
+                variance += np.einsum("ni,ni,n->in", J[:, :, 0], J[:, :, 1], mixed)
             out[f"{name}_u"], out[f"{name}_v"] = np.sqrt(variance)
+    if sigma is not None and rho is not None:
+        mixed = J[:, 0, 0] * J[:, 1, 0] * sigma[0] ** 2 + J[:, 0, 1] * J[:, 1, 1] * sigma[1] ** 2
+        across = J[:, 0, 0] * J[:, 1, 1] + J[:, 0, 1] * J[:, 1, 0]
+        mixed += across * rho * sigma[0] * sigma[1]
+        out["rho_uv"] = mixed / (out["sigma_u"] * out["sigma_v"])
     return out
 
 

@@ -29,6 +29,7 @@ from bayesdist.data import batches
 from bayesdist.data.batches import BATCH
 from bayesdist.data.columns import (
     COLUMNS,
+    CORRELATION,
     DEFAULT_LABELS,
     LABELS_OF_CODES,
     POSITIONS,
@@ -49,7 +50,7 @@ from bayesdist.data.reading.columns import (
 )
 from bayesdist.data.reading.options import ReadArguments, ReadOptions, refuse_missing_errors
 from bayesdist.data.repeated import buckets_for, first_repetition
-from bayesdist.data.sky import direction_of, direction_sum, sky_columns
+from bayesdist.data.sky import CORRELATIONS, direction_of, direction_sum, sky_columns
 from bayesdist.data.tables.checks import columns_of, refuse_half
 from bayesdist.data.tables.column import Quantities, SourceColumn
 from bayesdist.data.tables.parquet import ParquetPart, RowBlock, describe_part
@@ -68,7 +69,7 @@ Labelled = tuple[Int, tuple[str, ...]]
 # columns, their units, and header values that no column holds
 Part = tuple[Mapping[str, NDArray[Any] | Labelled], Mapping[str, str], Mapping[str, Any]]
 _NUMBERS = (
-    *("x", "y", "u", "v", "sigma_u", "sigma_v", "epoch", "mag", "colour"),
+    *("x", "y", "u", "v", "sigma_u", "sigma_v", "rho_uv", "epoch", "mag", "colour"),
     *("u_nominal", "v_nominal"),
 )
 _LENGTHS = ("u", "v", "sigma_u", "sigma_v", "u_nominal", "v_nominal")
@@ -234,6 +235,8 @@ def _columns_of(file: StoredFile) -> set[str]:
         available.add("epoch")
     if _has_errors(file):
         available |= set(SIGMAS)
+    if "sigma_ra" in file.found and CORRELATIONS & set(file.found):
+        available.add(CORRELATION)
     for on_sky, on_plane in (("pm_ra", "pm"), ("sigma_pm_ra", "sigma_pm")):
         if on_sky in file.found:
             available |= {f"{on_plane}_u", f"{on_plane}_v"}

@@ -103,7 +103,7 @@ def present_columns(
     on_sky = is_on_sky(names, present, columns, source)
     unread = {"u", "v"} if on_sky else {"ra", "dec", *SKY_QUANTITIES}
     if not read_sigma:
-        unread |= {"sigma_u", "sigma_v"}
+        unread |= {"sigma_u", "sigma_v", "rho_uv"}
     if not read_sigma or "sigma_u" in present:  # errors of the match include those of the catalogue
         unread |= {"sigma_ra", "sigma_dec"}
     if "mag" in present:
@@ -237,9 +237,7 @@ def match_columns(quantities: Quantities, options: ReadOptions) -> dict[str, Any
             )
         out["u"], out["v"] = (column(key).numbers() for key in ("u", "v"))
         out["unit"] = position_unit((column("u"), column("v")), options.unit)
-    for key in ("sigma_u", "sigma_v"):
-        if key in present:
-            out[key] = _sigma(column(key), out["unit"])
+    out |= _errors(quantities, out["unit"])
     at = options.tangent_point
     for key in nominal_columns(present, source=quantities.source, tangent_point=at):
         out[key] = column(key).numbers() * column(key).factor(out["unit"])
@@ -293,6 +291,7 @@ def _projected(quantities: Quantities, options: ReadOptions, epoch: Float | None
         sky.dec,
         options.tangent_point,
         sigma=sky.sigma,
+        rho=sky.rho,
         motion=sky.motion,
         sigma_motion=sky.sigma_motion,
         where=source,
@@ -335,6 +334,15 @@ def nominal_columns(
     return keys
 
 
+def _errors(quantities: Quantities, unit: str) -> dict[str, Float]:
+    """Standard errors in the unit of u, v, and their correlation, as far as the table has them."""
+    keys = (key for key in ("sigma_u", "sigma_v") if key in quantities.found)
+    out = {key: _sigma(quantities[key], unit) for key in keys}
+    if "rho_uv" in quantities.found:
+        out["rho_uv"] = _correlation(quantities)
+    return out
+
+
 def _sigma(column: SourceColumn, unit: str) -> Float:
     """Standard errors in the unit of u, v."""
     sigma = column.numbers() * column.factor(unit)
@@ -351,6 +359,23 @@ def _sigma(column: SourceColumn, unit: str) -> Float:
             )
         raise column.fail(bad, f"sigma is {sigma[bad]:g}, and must be positive")
     return sigma
+
+
+def _correlation(quantities: Quantities) -> Float:
+    """Correlation of the errors in u and v."""
+    column = quantities["rho_uv"]
+    if "sigma_u" not in quantities:
+        raise InputError(
+            "is a correlation of errors, and the table has no errors sigma_u and sigma_v",
+            where=column.where,
+            do="name their columns, or leave the correlation out",
+        )
+    rho = column.numbers()
+    beyond = ~(np.abs(rho) < 1.0)
+    if beyond.any():
+        bad = int(np.argmax(beyond))
+        raise column.fail(bad, f"a correlation is {rho[bad]:g}, and must lie between -1 and 1")
+    return rho
 
 
 def text_labels(column: SourceColumn) -> tuple[str, ...]:

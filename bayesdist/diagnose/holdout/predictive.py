@@ -302,11 +302,13 @@ def groups_of(
 
 def noise_of(predictive: Predictive, table: Matches, index: Int) -> Float:
     """Covariance elements uu, vv, uv (n, 3) of stars, without the solution's errors."""
-    var = np.stack(errors_of(table), axis=1)[index] ** 2 + predictive.jitter2
+    sigma = np.stack(errors_of(table), axis=1)[index]
+    var = sigma**2 + predictive.jitter2
     if predictive.local and not predictive.local_in_noise:
         place = (table.x[index], table.y[index], table.chip_number[index])
         var = var + predictive.local_variance(*place)[:, None]
-    return np.column_stack([var, np.zeros(len(var))])
+    mixed = np.zeros(len(var)) if table.rho_uv is None else table.rho_uv[index] * sigma.prod(axis=1)
+    return np.column_stack([var, mixed])
 
 
 @dataclass(frozen=True, eq=False)

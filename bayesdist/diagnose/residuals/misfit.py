@@ -168,8 +168,7 @@ def error_scale(fit: LinearFit, table: Matches) -> float:
     false.  `table` contains the matches or a part of them.
     """
     stars, _ = prepare(fit.model, table)
-    r = stars.residuals(np.asarray(fit.mean))
-    quantile = np.quantile(r[:, 0] ** 2 / stars.var_u + r[:, 1] ** 2 / stars.var_v, LOW_QUANTILE)
+    quantile = np.quantile(stars.chi2(np.asarray(fit.mean)), LOW_QUANTILE)
     factor = float(np.sqrt(quantile / chi2_ppf(LOW_QUANTILE, 2)))
     return 1.0 if QUOTED_ERRORS.met_by(factor) else factor
 

@@ -149,7 +149,7 @@ def star_sample(
         fit_residual=residual(fit.mean),
         used=in_table_order(fit.clip.keeps_of(stars), order),
         n_total=n_total,
-        variance=in_table_order(solution.variances(stars).T, order),
+        variance=in_table_order(solution.covariances(stars)[0::2].T, order),
         posterior_residual=None if posterior is None else residual(solution.theta),
         outlier_probability=None if membership is None else membership.outlier_probability,
     )

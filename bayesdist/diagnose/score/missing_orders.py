@@ -171,7 +171,7 @@ def _chip_residuals(sample: ScoredSample) -> Iterator[ChipResiduals]:
             continue
         variance = sample.variance[:, rows] * (1.0 - leverage[:, rows])
         # rotate to the detector axes; the scale factors of the frames are close to 1
-        z = sample.residual[:, rows] / np.sqrt(variance)
+        z = sample.whitened[:, rows] / np.sqrt(1.0 - leverage[:, rows])
         z = np.einsum("nji,jn->in", _rotations(sample.turn[rows]), z)
         yield ChipResiduals(
             sample.model.order,

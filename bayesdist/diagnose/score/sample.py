@@ -79,6 +79,7 @@ class ScoredSample:
     from_nominal: Float | None = None  # (2, N) data minus nominal positions, if the table has them
     match_radius: float | None = None  # stated radius within which the stars were matched
     mixture: Constants | None = None  # of the likelihood, if it models false matches
+    covariance: Float | None = None  # (N,) of the errors in u and v; None if they are independent
 
     def __len__(self) -> int:
         return len(self.X)
@@ -95,6 +96,23 @@ class ScoredSample:
         """
         on_sky = np.broadcast_to(np.reshape(direction, (2, -1)), self.score.shape)
         return np.asarray(np.linalg.solve(self.turn, on_sky.T[..., None])[..., 0].T)
+
+    @cached_property
+    def whitened(self) -> Float:
+        """Residuals (2, N) of unit covariance for true matches: in units of their errors.
+
+        Correlated residuals are multiplied by the symmetric root of the inverse covariance, which
+        turns them least.
+        """
+        if self.covariance is None:
+            return np.asarray(self.residual / np.sqrt(self.variance))
+        uu, vv = self.variance
+        uv = self.covariance
+        # root of a symmetric 2 x 2 matrix C: (C + d) / t, with d^2 = |C| and t^2 = trace + 2 d
+        d = np.sqrt(uu * vv - uv**2)
+        t = np.sqrt(uu + vv + 2 * d)
+        u, v = self.residual
+        return np.asarray(np.stack([(vv + d) * u - uv * v, (uu + d) * v - uv * u]) / (d * t))
 
     @cached_property
     def whole_score(self) -> Float:
@@ -156,7 +174,7 @@ def scored_sample(
     likelihood = likelihood_of(solution)
     stars, order = prepare(solution.model, table.select(by_exposure))
     rows = by_exposure[order]
-    columns = likelihood.scores(stars)
+    columns, covariance = likelihood.scores(stars), likelihood.covariances(stars)
     shared = table.error_codes
     codes = np.arange(len(rows)) if shared is None else shared[rows]
     blocks = _blocks(stars, table.exposure[rows], likelihood.theta)
@@ -170,7 +188,8 @@ def scored_sample(
         score=columns[:2],
         curvature=columns[2:],
         residual=stars.residuals(likelihood.theta).T,
-        variance=likelihood.variances(stars),
+        variance=covariance[0::2],
+        covariance=covariance[1] if stars.is_correlated else None,
         inlier=likelihood.inliers(stars),
         mag=None if table.mag is None else table.mag[rows],
         colour=None if table.colour is None else table.colour[rows],

@@ -118,7 +118,7 @@ class _Radii:
             for squares in (square, sample.residual**2)
         )
         excess = square.sum(axis=0) / variance.sum(axis=0)[part] - 1.0
-        square = square / sample.variance
+        square = sample.whitened**2 / (1.0 - sample.leverage)
         t = square.mean(axis=0)
         scale = float(inlier @ t / n)
         return cls(
@@ -250,7 +250,7 @@ def truncation_test(sample: ScoredSample, match_radius: float | None) -> Outcome
     if worst.unit == sample.model.unit:
         end = worst.radius**2 / total_variance
     sigma = float(np.sqrt(np.median(total_variance[radii.part]) / 2))
-    chi2 = sample.residual**2 / (sample.variance * (1.0 - sample.leverage))
+    chi2 = sample.whitened**2 / (1.0 - sample.leverage)
     p_value = min(1.0, len(deficits) * worst.p_value)
     present = (
         f"the residuals end too abruptly: {worst.expected:.3g} true matches are expected beyond "

@@ -195,6 +195,7 @@ def star_covariance(
         raise InputError("errors of proper motions need the epochs of the matches")
     levers, variances = errors.levers(code, matches.epoch), errors.variances
     _require_contained(matches, code, variances, levers)
+    _refuse_correlated(matches)
     stars, order = prepare(solution.model, matches)
     used = solution.uses(matches)[order]
     inverse = np.stack([used / stars.var_u, used / stars.var_v])
@@ -209,6 +210,17 @@ def star_covariance(
         parts, counted = (follow @ c @ follow.T for c in (parts, counted))
     positions, *motions = ((part + part.T) / 2 for part in parts)
     return StarCovariance(sum(motions, positions), (counted + counted.T) / 2, *motions)
+
+
+def _refuse_correlated(matches: Matches) -> None:
+    """Raise InputError for matches whose errors are correlated between u and v."""
+    if matches.rho_uv is not None and matches.rho_uv.any():
+        raise InputError(
+            "the errors of the matches are correlated between u and v, and errors that stars have "
+            "in common are taken as independent on both axes",
+            where=", ".join(matches.sources),
+            do="leave the column rho_uv out",
+        )
 
 
 def _require_contained(matches: Matches, code: Int, variances: Float, levers: Float) -> None:
@@ -285,6 +297,7 @@ def star_influence(
     """
     code = matches.column("star")
     model, D = fit.model, fit.model.n_distortion
+    _refuse_correlated(matches)
     n_levers = 1 if errors.motion is None else 2
     by = np.zeros((n_levers, 2, len(codes), D))
     wanted = np.isin(code, codes) & fit.uses(matches)

@@ -502,6 +502,7 @@ def fold_sums(stars: Stars, theta: Float, clip: Clip, folds: int) -> FoldStatist
 
 
 def _sums(stars: Stars, code: Int, n: int, theta: Float, clip: Clip) -> FoldStatistics:
+    stars = stars.without_correlations()  # both axes are solved separately
     count = np.bincount(code, minlength=n)
     order = np.argsort(code, kind="stable")
     present = np.flatnonzero(count)
@@ -512,7 +513,7 @@ def _sums(stars: Stars, code: Int, n: int, theta: Float, clip: Clip) -> FoldStat
 
     moments = kernel.least_squares_moments(
         kernel.pieces_of(starts, kernel.PIECE),
-        tuple(column[order] for column in stars.columns),
+        tuple(column[order] if len(column) else column for column in stars.columns),
         powers(theta),
         powers(clip.theta),
         stars.model.order,

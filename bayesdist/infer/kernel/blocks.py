@@ -20,8 +20,8 @@ from typing import Any
 import numba as nb
 import numpy as np
 
-from bayesdist.infer.kernel.lanes import FAST, INNER, copy
-from bayesdist.infer.kernel.numeric import whole_vectors
+from bayesdist.infer.kernel.lanes import FAST, INNER, WIDTH, copy, load, put
+from bayesdist.infer.kernel.numeric import evaluate, whole_vectors
 from bayesdist.utils.arrays import Float, Int
 
 # options of compiled passes; a check for division by zero would prevent vectorisation
@@ -75,8 +75,8 @@ def scratch(n: int) -> Float:
 
 
 def star_room() -> tuple[Float, Float]:
-    """Scratch rows for the columns of a block of stars (6), and for the model positions (2)."""
-    return scratch(6), scratch(2)
+    """Scratch rows for the columns of a block of stars (8), and for the model positions (2)."""
+    return scratch(8), scratch(2)
 
 
 @nb.njit(**INNER)
@@ -90,7 +90,12 @@ def put_ones(rows, n):
 
 @nb.njit(**INNER)
 def lay_out(columns, first, end, rows):
-    """Copy X, Y, u, v, var_u, var_v of the stars first..end to scratch rows, followed by ones."""
+    """Copy the columns of the stars first..end to scratch rows, followed by ones.
+
+    The columns are X, Y, u, v, var_u, var_v and, unless they are empty, the cosine and sine of the
+    angle from u to the first principal axis of a star's errors.  u, v and the variances are then
+    along the principal axes.
+    """
     whole_vectors()
     n = end - first
     copy(columns[0], first, n, rows, 0)
@@ -99,7 +104,45 @@ def lay_out(columns, first, end, rows):
     copy(columns[3], first, n, rows, 3)
     copy(columns[4], first, n, rows, 4)
     copy(columns[5], first, n, rows, 5)
+    if len(columns[6]):
+        copy(columns[6], first, n, rows, 6)
+        copy(columns[7], first, n, rows, 7)
     put_ones(rows, n)
+
+
+@nb.njit(**INNER)
+def modelled(columns, coef, order, stars, n, model):
+    """Write the positions of n stars by coefficients (2, K), along the axes of `lay_out`."""
+    whole_vectors()
+    evaluate(coef, order, stars, n, model)
+    if len(columns[6]):
+        for s in range(0, n, WIDTH):
+            c, d = load(stars, 6, s), load(stars, 7, s)
+            u, v = load(model, 0, s), load(model, 1, s)
+            put(model, 0, s, c * u + d * v)
+            put(model, 1, s, c * v - d * u)
+
+
+@nb.njit(**INNER)
+def off_axes(columns, stars, n, weighted, vectors):
+    """Turn weights of n stars from the principal axes of their errors to u and v.
+
+    The first three rows of `weighted` are matrices uu, uv, vv; pairs of rows from the third on, as
+    many as `vectors`, are vectors.
+    """
+    whole_vectors()
+    if len(columns[6]):
+        for s in range(0, n, WIDTH):
+            c, d = load(stars, 6, s), load(stars, 7, s)
+            cc, cd, dd = c * c, c * d, d * d
+            uu, uv, vv = load(weighted, 0, s), load(weighted, 1, s), load(weighted, 2, s)
+            put(weighted, 0, s, cc * uu - 2.0 * cd * uv + dd * vv)
+            put(weighted, 1, s, cd * (uu - vv) + (cc - dd) * uv)
+            put(weighted, 2, s, dd * uu + 2.0 * cd * uv + cc * vv)
+            for k in range(3, 3 + 2 * vectors, 2):
+                u, v = load(weighted, k, s), load(weighted, k + 1, s)
+                put(weighted, k, s, c * u - d * v)
+                put(weighted, k + 1, s, d * u + c * v)
 
 
 def share_out(

@@ -16,6 +16,7 @@ from bayesdist.infer.kernel.blocks import (
     BLOCK,
     PASS,
     lay_out,
+    modelled,
     put_ones,
     scratch,
     share_out,
@@ -37,7 +38,6 @@ from bayesdist.infer.kernel.lanes import (
 )
 from bayesdist.infer.kernel.numeric import (
     bits_of,
-    evaluate,
     exp_negative,
     from_bits,
     inverse_root,
@@ -65,7 +65,7 @@ def _partial_sums(
         lay_out(columns, a, e, stars)
         put_ones(density, n)
         for d in range(len(rows)):
-            evaluate(coef[d, g], order, stars, n, model)
+            modelled(columns, coef[d, g], order, stars, n, model)
             j2, core, outlier = rows[d, 0], rows[d, 1], rows[d, 2]
             half, never = rows[d, 3], rows[d, 4]
             exponents = spread(0.0, load(density, 0, 0))
@@ -104,7 +104,7 @@ def log_likelihood(
     blocks : ndarray of int, shape (n, 3)
         Pieces of size `BLOCK` from `pieces_of`.
     columns : tuple of ndarray, shape (N,)
-        X, Y, u, v, var_u, var_v.
+        `Stars.columns`.
     coef : ndarray, shape (D, G, 2, K)
         Effective coefficients of the powers X^i Y^j of the scaled pixel coordinates, for G groups.
     order : int

@@ -20,6 +20,8 @@ from bayesdist.infer.kernel.blocks import (
     PASS,
     aligned,
     lay_out,
+    modelled,
+    off_axes,
     put_ones,
     scratch,
     share_out,
@@ -42,7 +44,6 @@ from bayesdist.infer.kernel.lanes import (
 )
 from bayesdist.infer.kernel.mixture import Constants, log_of_product, packed
 from bayesdist.infer.kernel.numeric import (
-    evaluate,
     exp_negative,
     inverse_root,
     legendre,
@@ -124,7 +125,7 @@ def room_for(order: int, columns: int) -> tuple[Float, ...]:
     """
     T = 2 * order + 1
     return (
-        *(scratch(n) for n in (6, 2, 2, columns, T, T)),
+        *(scratch(n) for n in (8, 2, 2, columns, T, T)),
         aligned(columns // ROWS, T, T, ROWS, WIDTH),
     )
 
@@ -179,7 +180,7 @@ def _least_squares(
 ):  # fmt: skip
     whole_vectors()
     chi2_limit, r2_limit, corner, power = rules[0], rules[1], rules[2], int(rules[3])
-    zero = spread(0.0, load(about, 0, 0))
+    zero, turned = spread(0.0, load(about, 0, 0)), len(columns[6]) > 0
     for b in range(start, stop):
         g, first, end = pieces[b]
         used_sum = far_sum = chi2 = uu = vv = left_out = weighted_chi2 = u_sum = v_sum = zero
@@ -187,8 +188,8 @@ def _least_squares(
             e = min(a + BLOCK, end)
             n = e - a
             lay_out(columns, a, e, stars)
-            evaluate(coef_about[g], order, stars, n, about)
-            evaluate(coef_test[g], order, stars, n, test)
+            modelled(columns, coef_about[g], order, stars, n, about)
+            modelled(columns, coef_test[g], order, stars, n, test)
             for s in range(0, n, WIDTH):
                 x, y = load(stars, 0, s), load(stars, 1, s)
                 u, v = load(stars, 2, s), load(stars, 3, s)
@@ -202,15 +203,20 @@ def _least_squares(
                 ru, rv = u - load(about, 0, s), v - load(about, 1, s)
                 wu, wv = factor * iu, factor * iv
                 put(weighted, 0, s, wu)
-                put(weighted, 1, s, wv)
+                put(weighted, 1, s, zero)
+                put(weighted, 2, s, wv)
                 put(weighted, 3, s, wu * ru)
                 put(weighted, 4, s, wv * rv)
                 used_sum, far_sum = used_sum + used, far_sum + (present - near)
                 chi2 += used * (ru * ru * iu + rv * rv * iv)
-                uu, vv = uu + used * ru * ru, vv + used * rv * rv
                 left_out += (present - used) * (ru * ru + rv * rv)
                 weighted_chi2 += wu * ru * ru + wv * rv * rv
+                if turned:
+                    c, d = load(stars, 6, s), load(stars, 7, s)
+                    ru, rv = c * ru - d * rv, d * ru + c * rv
+                uu, vv = uu + used * ru * ru, vv + used * rv * rv
                 u_sum, v_sum = u_sum + used * ru, v_sum + used * rv
+            off_axes(columns, stars, n, weighted, 1)
             legendre(stars, n, 2 * order, P, Q)
             add_columns(weighted, n, P, Q, lanes)
         write_columns(lanes, sums[b])
@@ -232,8 +238,8 @@ def _mixture(
 ):  # fmt: skip
     whole_vectors()
     wavering, log_unit = 0.0 if em else 1.0, math.log(2 * math.pi * unit2)
-    j2, core, outlier, half, never = row[0], row[1], row[2], row[3], row[4]
-    f, w = row[5], row[6]
+    j2, core, outlier, half = row[0], row[1], row[2], row[3]
+    never, f, w = row[4], row[5], row[6]
     zero = spread(0.0, load(density, 0, 0))
     for b in range(start, stop):
         g, first, end = pieces[b]
@@ -243,15 +249,14 @@ def _mixture(
             e = min(a + BLOCK, end)
             n = e - a
             lay_out(columns, a, e, stars)
-            evaluate(coef[g], order, stars, n, model)
+            modelled(columns, coef[g], order, stars, n, model)
             put_ones(density, n)
             for s in range(0, n, WIDTH):
                 ru = load(stars, 2, s) - load(model, 0, s)
                 rv = load(stars, 3, s) - load(model, 1, s)
                 au, av = load(stars, 4, s) + j2, load(stars, 5, s) + j2
                 root = inverse_root(au * av)
-                inverse = root * root
-                iu, iv = av * inverse, au * inverse
+                iu, iv = av * root * root, au * root * root
                 eu, ev = ru * ru * iu, rv * rv * iv
                 r2 = ru * ru + rv * rv
                 q_in, q_out = 0.5 * (eu + ev), r2 * half + never
@@ -293,6 +298,7 @@ def _mixture(
                 js, pp, fs = js - pq * D_j * D_s, pp + pq, fs + pq * D_s
                 ss += 2.0 * p * r2 * w - pq * D_s * D_s
             logs += log_of_product(density) - n * log_unit
+            off_axes(columns, stars, n, weighted, 1 if em else 4)
             legendre(stars, n, 2 * order, P, Q)
             add_columns(weighted, n, P, Q, lanes)
         write_columns(lanes, sums[b])
@@ -340,7 +346,7 @@ def least_squares_moments(
     pieces : ndarray, shape (n, 3)
         Pieces of size `PIECE` from `pieces_of`.
     columns : tuple of ndarray, shape (N,)
-        X, Y, u, v, var_u, var_v.
+        `Stars.columns`.
     about : ndarray, shape (G, 2, K)
         Effective coefficients of the scaled powers at which residuals are computed.
     test : ndarray, shape (G, 2, K)
@@ -379,8 +385,7 @@ def least_squares_moments(
             room=lambda: room_for(order, 6),
         )
     total = _by_group(sums, pieces)
-    weight = np.zeros((len(about), 3, K, K))
-    weight[:, 0::2] = _matrices(total[:, :2], order)
+    weight = _matrices(total[:, :3], order)
     right = total[:, 3:5, :K].copy()
     return Moments(weight, right, np.zeros((len(about), N_HYPER, 2, K)), scalars.sum(axis=0))
 

@@ -11,10 +11,17 @@ import math
 import numba as nb
 import numpy as np
 
-from bayesdist.infer.kernel.blocks import PASS, lay_out, share_out, star_room, threads_for
+from bayesdist.infer.kernel.blocks import (
+    PASS,
+    lay_out,
+    modelled,
+    share_out,
+    star_room,
+    threads_for,
+)
 from bayesdist.infer.kernel.lanes import FAST
 from bayesdist.infer.kernel.mixture import Constants, packed
-from bayesdist.infer.kernel.numeric import evaluate, exp_negative, whole_vectors
+from bayesdist.infer.kernel.numeric import exp_negative, whole_vectors
 from bayesdist.utils.arrays import Float, Int
 
 
@@ -24,21 +31,21 @@ def _residuals(first, end, stars, model, blocks, columns, coef, order, out):
     for b in range(first, end):
         g, a, e = blocks[b]
         lay_out(columns, a, e, stars)
-        evaluate(coef[g], order, stars, e - a, model)
+        modelled(columns, coef[g], order, stars, e - a, model)
         for s in range(e - a):
             out[a + s, 0] = stars[2, s] - model[0, s]
             out[a + s, 1] = stars[3, s] - model[1, s]
 
 
 def residuals(blocks: Int, columns: tuple[Float, ...], coef: Float, order: int) -> Float:
-    """Residuals of the stars: data minus model.
+    """Residuals of the stars, data minus model, along the principal axes of their errors.
 
     Parameters
     ----------
     blocks : ndarray of int, shape (n, 3)
         Pieces of size `BLOCK` from `pieces_of`.
     columns : tuple of ndarray, shape (N,)
-        X, Y, u, v, var_u, var_v.
+        `Stars.columns`.
     coef : ndarray, shape (G, 2, K)
         Effective coefficients of the scaled powers.
     order : int
@@ -74,7 +81,7 @@ def _memberships(first, end, stars, model, blocks, columns, coef, order, rows, u
         lay_out(columns, a, e, stars)
         for d in range(len(rows)):
             mean = out[d // each]
-            evaluate(coef[d, g], order, stars, n, model)
+            modelled(columns, coef[d, g], order, stars, n, model)
             for s in range(n):
                 ru, rv = stars[2, s] - model[0, s], stars[3, s] - model[1, s]
                 iu, iv = 1.0 / (stars[4, s] + rows[d, 0]), 1.0 / (stars[5, s] + rows[d, 0])

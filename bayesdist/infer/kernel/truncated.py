@@ -22,6 +22,8 @@ from bayesdist.infer.kernel.blocks import (
     BLOCK,
     PASS,
     lay_out,
+    modelled,
+    off_axes,
     share_out,
     star_room,
     threads_for,
@@ -40,7 +42,7 @@ from bayesdist.infer.kernel.moments import (
     room_for,
     write_columns,
 )
-from bayesdist.infer.kernel.numeric import evaluate, exp_negative, legendre, whole_vectors
+from bayesdist.infer.kernel.numeric import exp_negative, legendre, whole_vectors
 from bayesdist.utils.arrays import Float, Int
 
 SCRATCH = 16_000_000  # bytes of partial sums in memory at a time
@@ -48,7 +50,7 @@ INTEGRAL = 30  # cost per star, relative to a likelihood evaluation without a ci
 N_TERMS = COLUMNS + N_MIXTURE  # number of terms (columns and scalars) per star
 
 
-# In the loops, `stars` are the columns X, Y, u, v, var_u, var_v, off_u, off_v.  `circle` is a tuple
+# In the loops, `stars` are `Stars.columns` and `Stars.offsets`.  `circle` is a tuple
 # of True for Gaussian outliers, the radius, and the `NODES` of the integral.
 
 
@@ -57,7 +59,7 @@ def _residual(stars, i, model, s, j2):
     """Residual of a star, nominal minus model position, and its variances (all in u and v)."""
     whole_vectors()
     ru, rv = stars[2][i] - model[0, s], stars[3][i] - model[1, s]
-    return ru, rv, ru + stars[6][i], rv + stars[7][i], stars[4][i] + j2, stars[5][i] + j2
+    return ru, rv, ru + stars[8][i], rv + stars[9][i], stars[4][i] + j2, stars[5][i] + j2
 
 
 @nb.njit(cache=True, forceinline=True, fastmath=FAST)
@@ -104,7 +106,7 @@ def _evaluated(
         if wanted:
             out[:, :, a:e] = 0.0
         for d in range(n_draws):
-            evaluate(coef[d, g], order, places, e - a, model)
+            modelled(stars, coef[d, g], order, places, e - a, model)
             total = 0.0
             for i in range(a, e):
                 star = _residual(stars, i, model, i - a, rows[d, 0])
@@ -199,7 +201,7 @@ def _moments(
             e = min(a + BLOCK, end)
             n = e - a
             lay_out(stars, a, e, places)
-            evaluate(coef[g], order, places, n, model)
+            modelled(stars, coef[g], order, places, n, model)
             legendre(places, n, 2 * order, P, Q)
             weighted[:] = 0.0
             for s in range(n):
@@ -210,6 +212,7 @@ def _moments(
                 for k in range(N_MIXTURE):
                     scalars[b, k] += terms[COLUMNS + k]
             scalars[b, 0] -= n * log_unit
+            off_axes(stars, places, n, weighted, 1 if em else 4)
             add_columns(weighted, n, P, Q, lanes)
         write_columns(lanes, sums[b])
 
@@ -222,7 +225,7 @@ def _scores(first, end, places, model, blocks, stars, coef, order, row, circle, 
         q, work, zc, zo = np.empty(MOST), np.empty(MOST), np.empty(10), np.empty(10)
         terms = np.empty(N_TERMS)
         lay_out(stars, a, e, places)
-        evaluate(coef[g], order, places, e - a, model)
+        modelled(stars, coef[g], order, places, e - a, model)
         for i in range(a, e):
             star = _residual(stars, i, model, i - a, row[0])
             _terms(star, row, circle, 1.0, q, work, zc, zo, terms)
@@ -381,7 +384,7 @@ def truncated_scores(
     order: int,
     constants: Constants,
 ) -> Float:
-    """Derivatives of each star's log-likelihood with respect to the model position.
+    """Derivatives of each star's log-likelihood along the principal axes of its errors.
 
     Parameters
     ----------
@@ -397,7 +400,8 @@ def truncated_scores(
     Returns
     -------
     ndarray, shape (5, N)
-        First derivatives in u and v, and minus the second derivatives uu, uv, vv.
+        First derivatives with respect to the model position along both axes, and minus the second
+        derivatives 11, 12, 22.
     """
     out = np.empty((5, len(columns[0])))
     with threads_for(INTEGRAL * out.shape[1]):

@@ -424,9 +424,7 @@ def _some_residuals(stars: Stars, theta: Float, every: int) -> tuple[Float, ...]
 
 def _some_chi2(stars: Stars, theta: Float, every: int) -> tuple[Float, ...]:
     """Chi-square (sum over both axes) of every `every`-th star."""
-    residual = stars.residuals(theta)[::every]
-    var = np.stack([stars.var_u[::every], stars.var_v[::every]], axis=1)
-    return ((residual**2 / var).sum(axis=1),)
+    return (stars.chi2(theta)[::every],)
 
 
 @takes(solution=Solution, matches=Matches)

@@ -381,8 +381,8 @@ class Likelihood(Protocol):
     def inliers(self, stars: Stars) -> Float:
         """Probability (N,) that each star is a true match."""
 
-    def variances(self, stars: Stars) -> Float:
-        """Variances (2, N) of true matches along u and v."""
+    def covariances(self, stars: Stars) -> Float:
+        """Covariances uu, uv, vv (3, N) of true matches."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -400,10 +400,8 @@ class Clip:
 
     def keeps_of(self, stars: Stars) -> Bool:
         """Boolean mask (N,) that is True for prepared stars within both limits."""
-        residual = stars.residuals(self.theta)
-        chi2 = residual[:, 0] ** 2 / stars.var_u + residual[:, 1] ** 2 / stars.var_v
-        r2 = (residual**2).sum(axis=1)
-        return np.asarray((chi2 <= self.chi2_limit) & (r2 <= self.abs_limit**2))
+        r2 = (stars.residuals(self.theta) ** 2).sum(axis=1)
+        return np.asarray((stars.chi2(self.theta) <= self.chi2_limit) & (r2 <= self.abs_limit**2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -415,18 +413,18 @@ class ClippedGaussian:
 
     def scores(self, stars: Stars) -> Float:
         """Derivatives of the log-likelihood (see `Likelihood.scores`); zero for rejected stars."""
-        r = stars.residuals(self.theta).T
+        r = stars.residuals_along_axes(self.theta).T
         used = self.clip.keeps_of(stars)
-        w_u, w_v = used / stars.var_u, used / stars.var_v
-        return np.stack([w_u * r[0], w_v * r[1], w_u, np.zeros(len(stars)), w_v])
+        w = np.stack([used / stars.var_u, used / stars.var_v])
+        return np.concatenate([stars.off_axes(w * r), stars.matrices_off_axes(w[0], 0.0, w[1])])
 
     def inliers(self, stars: Stars) -> Float:
         """1 for stars within the limits, 0 for rejected stars; shape (N,)."""
         return self.clip.keeps_of(stars).astype(float)
 
-    def variances(self, stars: Stars) -> Float:
-        """Variances (2, N) from the quoted errors, in the unit of u and v squared."""
-        return np.stack([stars.var_u, stars.var_v])
+    def covariances(self, stars: Stars) -> Float:
+        """Covariances uu, uv, vv (3, N) of the quoted errors, in the unit of u and v squared."""
+        return stars.covariances()
 
 
 @dataclass(frozen=True, eq=False)
@@ -439,7 +437,7 @@ class MixtureAt:
     def scores(self, stars: Stars) -> Float:
         """Derivatives of the log-likelihood; see `Likelihood.scores`."""
         if circle := stars.circle(self.constants):
-            return kernel.truncated_scores(
+            scores = kernel.truncated_scores(
                 stars.blocks,
                 stars.columns,
                 circle,
@@ -447,7 +445,10 @@ class MixtureAt:
                 stars.model.order,
                 self.constants,
             )
-        r = stars.residuals(self.theta).T
+            return np.concatenate(
+                [stars.off_axes(scores[:2]), stars.matrices_off_axes(*scores[2:])]
+            )
+        r = stars.residuals_along_axes(self.theta).T
         p = star_averages(stars, self.theta[None], self.constants)[0]
         j2, out = self.constants.j2[0], self.constants.out[0]
         outlier = 1 / out if self.constants.kind == GAUSSIAN else 0.0
@@ -455,16 +456,18 @@ class MixtureAt:
         mean = (1 - p) * w + p * outlier
         # derivative of log(core / outlier) with respect to the residual
         turn = (outlier - w) * r
-        uu, vv = mean - p * (1 - p) * turn**2
-        return np.stack([*(mean * r), uu, -p * (1 - p) * turn[0] * turn[1], vv])
+        first, second = mean - p * (1 - p) * turn**2
+        mixed = -p * (1 - p) * turn[0] * turn[1]
+        curvature = stars.matrices_off_axes(first, mixed, second)
+        return np.concatenate([stars.off_axes(mean * r), curvature])
 
     def inliers(self, stars: Stars) -> Float:
         """Probability (N,) that each star belongs to the core of the mixture."""
         return 1.0 - star_averages(stars, self.theta[None], self.constants)[0]
 
-    def variances(self, stars: Stars) -> Float:
-        """Variances (2, N) from quoted errors and jitter, in the unit of u and v squared."""
-        return np.stack([stars.var_u, stars.var_v]) + self.constants.j2[0]
+    def covariances(self, stars: Stars) -> Float:
+        """Covariances uu, uv, vv (3, N) of quoted errors and jitter, in that unit squared."""
+        return stars.covariances(float(self.constants.j2[0]))
 
 
 def star_averages(stars: Stars, theta: Float, constants: Constants) -> Float:

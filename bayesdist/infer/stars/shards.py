@@ -35,7 +35,7 @@ BRANCHES = 16  # number of branches of the summation tree
 SAMPLE = 1_000_000  # number of stars used to compute the median error
 
 EMPTY = np.zeros(0)
-COLUMNS, OFFSETS = ("X", "Y", "u", "v", "var_u", "var_v"), ("off_u", "off_v")
+COLUMNS = ("X", "Y", "u", "v", "var_u", "var_v")
 
 # relative tolerance for stars at the edge of their match circle
 ROUNDING = 1e-6
@@ -212,7 +212,8 @@ class Store:
 
     def __init__(self, budget: float) -> None:
         self._left = budget
-        self._kept: list[tuple[Stars, tuple[io.FileIO, int] | None]] = []
+        # stars, and if their columns are in a scratch file: the file, the place, and their names
+        self._kept: list[tuple[Stars, tuple[io.FileIO, int, tuple[str, ...]] | None]] = []
         self._file: io.FileIO | None = None
 
     def __len__(self) -> int:
@@ -231,7 +232,8 @@ class Store:
                 self._file = tempfile.TemporaryFile(buffering=0, prefix="bayesdist-")  # noqa: SIM115
                 self._closed = weakref.finalize(self, self._file.close)
             place = (self._file, self._file.seek(0, 2))
-            for column in (*stars.columns, *stars.offsets):
+            for name in _names(stars):
+                column = getattr(stars, name)
                 _write(self._file, np.ascontiguousarray(column).view(np.uint8).data)
         except OSError as error:
             raise InputError(
@@ -239,10 +241,10 @@ class Store:
                 where=_folder(),
                 do="set TMPDIR to a folder with more space, or increase compute.memory_mb",
             ) from error
-        none: dict[str, Any] = dict.fromkeys(COLUMNS + OFFSETS[: len(stars.offsets)], EMPTY)
+        none: dict[str, Any] = dict.fromkeys(_names(stars), EMPTY)
         frame = replace(stars, **none)
         frame.__dict__.update(blocks=stars.blocks, pieces=stars.pieces)
-        self._kept.append((frame, place))
+        self._kept.append((frame, (*place, _names(stars))))
 
     def close(self) -> None:
         """Release the shards and the scratch file."""
@@ -255,9 +257,8 @@ class Store:
         for stars, place in self._kept:
             yield stars if place is None else self._restored(stars, *place)
 
-    def _restored(self, frame: Stars, file: io.FileIO, place: int) -> Stars:
+    def _restored(self, frame: Stars, file: io.FileIO, place: int, names: tuple[str, ...]) -> Stars:
         n = int(frame.starts[-1])
-        names = COLUMNS + OFFSETS[: len(frame.offsets)]
         columns = np.empty((len(names), n))
         file.seek(place)
         view, done = columns.ravel().view(np.uint8).data, 0
@@ -270,6 +271,12 @@ class Store:
         stars = replace(frame, **read)
         stars.__dict__.update(blocks=frame.blocks, pieces=frame.pieces)
         return stars
+
+
+def _names(stars: Stars) -> tuple[str, ...]:
+    """Names of the columns that stars have."""
+    offsets = ("off_u", "off_v")[: len(stars.offsets)]
+    return COLUMNS + offsets + (("cos", "sin") if stars.is_correlated else ())
 
 
 def _write(file: io.FileIO, view: memoryview) -> None:
@@ -390,7 +397,7 @@ def survey(stars: Stars, matches: Matches, every: int) -> Survey:
             : len(model.exposures)
         ],
         chips=tuple(chips),
-        variance=(stars.var_u[::every].copy(), stars.var_v[::every].copy()),
+        variance=tuple(v[::every].copy() for v in stars.covariances()[0::2]),
         sources=matches.sources,
         farthest=_farthest(matches),
     )

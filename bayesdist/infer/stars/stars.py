@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, ClassVar, Self
 
@@ -18,6 +18,7 @@ from bayesdist.model import DistortionModel, Groups, merge_groups
 from bayesdist.utils.arrays import Float, Int
 
 NOBODY = np.zeros(0, np.int64)
+NONE = np.zeros(0)
 
 Rows = tuple[Int, ...]
 
@@ -26,7 +27,10 @@ Rows = tuple[Int, ...]
 class Stars:
     """Matched stars, sorted by group.
 
-    Stars of a group have the same effective polynomial coefficients (chip, exposure and date).
+    Stars of a group have the same effective polynomial coefficients (chip, exposure and date).  If
+    the errors of some stars are correlated between u and v, the data of all stars are along the
+    principal axes of their errors.  The jitter and the scatter of false matches are isotropic, so
+    that the covariance of each star is diagonal there.
     """
 
     model: DistortionModel
@@ -42,14 +46,24 @@ class Stars:
     # unknown
     off_u: Float | None = None
     off_v: Float | None = None
+    # cosine and sine (N,) of the angle from u to the first principal axis; empty if no errors are
+    # correlated
+    cos: Float = field(default_factory=lambda: NONE)
+    sin: Float = field(default_factory=lambda: NONE)
 
     def __len__(self) -> int:
         return len(self.X)
 
     @property
     def columns(self) -> tuple[Float, ...]:
-        """Columns X, Y, u, v, var_u and var_v, each (N,)."""
-        return self.X, self.Y, self.u, self.v, self.var_u, self.var_v
+        """Columns X, Y, u, v, var_u, var_v, cos and sin, each (N,) or, for the last two, empty."""
+        data = self.X, self.Y, self.u, self.v, self.var_u, self.var_v
+        return *data, self.cos, self.sin
+
+    @property
+    def is_correlated(self) -> bool:
+        """True if the errors of some stars are correlated between u and v."""
+        return len(self.cos) > 0
 
     @property
     def offsets(self) -> tuple[Float, ...]:
@@ -64,7 +78,8 @@ class Stars:
     def nbytes(self) -> int:
         """Size of all columns in bytes."""
         shared = self.var_u is self.var_v
-        return 8 * len(self) * ((5 if shared else 6) + len(self.offsets))
+        turns = len(self.cos) + len(self.sin)
+        return 8 * (len(self) * ((5 if shared else 6) + len(self.offsets)) + turns)
 
     def __sizeof__(self) -> int:
         """Size of all columns in bytes, which Dask uses to estimate the cost of moving a shard."""
@@ -90,7 +105,52 @@ class Stars:
 
     def residuals(self, theta: Float) -> Float:
         """Residuals (N, 2), data minus model, in the order of this object."""
+        return self.off_axes(self.residuals_along_axes(theta).T).T
+
+    def residuals_along_axes(self, theta: Float) -> Float:
+        """Residuals (N, 2) along the principal axes of the errors."""
         return kernel.residuals(self.blocks, self.columns, self.powers(theta), self.model.order)
+
+    def chi2(self, theta: Float) -> Float:
+        """Chi-square (N,) of the stars, both axes together, with the quoted errors."""
+        r = self.residuals_along_axes(theta)
+        return np.asarray(r[:, 0] ** 2 / self.var_u + r[:, 1] ** 2 / self.var_v)
+
+    def off_axes(self, vectors: Float) -> Float:
+        """Turn vectors (2, N) from the principal axes of the errors to u and v."""
+        if not self.is_correlated:
+            return vectors
+        a, b = vectors
+        return np.stack([self.cos * a - self.sin * b, self.sin * a + self.cos * b])
+
+    def matrices_off_axes(self, first: Float, mixed: Float | float, second: Float) -> Float:
+        """Turn symmetric matrices with elements (N,) to u and v; returns uu, uv, vv (3, N)."""
+        mixed = np.broadcast_to(mixed, np.shape(first))
+        if not self.is_correlated:
+            return np.stack([first, mixed, second])
+        cc, cs, ss = self.cos**2, self.cos * self.sin, self.sin**2
+        return np.stack(
+            [
+                cc * first - 2 * cs * mixed + ss * second,
+                cs * (first - second) + (cc - ss) * mixed,
+                ss * first + 2 * cs * mixed + cc * second,
+            ]
+        )
+
+    def without_correlations(self) -> Stars:
+        """Stars with the same errors in u and in v, taken as independent."""
+        if not self.is_correlated:
+            return self
+        var_u, _, var_v = self.covariances()
+        u, v = self.off_axes(np.stack([self.u, self.v]))
+        off: dict[str, Any] = {}
+        if self.off_u is not None and self.off_v is not None:
+            off = dict(zip(("off_u", "off_v"), self.off_axes(np.stack(self.offsets)), strict=True))
+        return replace(self, u=u, v=v, var_u=var_u, var_v=var_v, cos=NONE, sin=NONE, **off)
+
+    def covariances(self, added: float = 0.0) -> Float:
+        """Covariances uu, uv, vv (3, N) of the quoted errors, plus a variance `added` per axis."""
+        return self.matrices_off_axes(self.var_u + added, 0.0, self.var_v + added)
 
     def pixels(self) -> tuple[Float, Float]:
         """Pixel coordinates x, y (N,), FITS 1-based."""
@@ -138,7 +198,29 @@ def prepare(model: DistortionModel, matches: Matches) -> tuple[Stars, Int]:
         off_u=None if matches.u_nominal is None else (matches.u_nominal - matches.u)[order],
         off_v=None if matches.v_nominal is None else (matches.v_nominal - matches.v)[order],
     )
+    if matches.rho_uv is not None and matches.rho_uv.any():
+        stars = _along_axes(stars, sigma_v[order] ** 2, matches.rho_uv[order])
     return stars, np.arange(len(x))[order]
+
+
+def _along_axes(stars: Stars, var_v: Float, rho: Float) -> Stars:
+    """Stars with their data turned to the principal axes of errors with correlations rho (N,)."""
+    mean, half = (stars.var_u + var_v) / 2, (stars.var_u - var_v) / 2
+    mixed = rho * np.sqrt(stars.var_u * var_v)
+    radius = np.hypot(half, mixed)
+    angle = 0.5 * np.arctan2(mixed, half)
+    c, s = np.cos(angle), np.sin(angle)
+
+    def turned(u: Float, v: Float) -> tuple[Float, Float]:
+        return c * u + s * v, c * v - s * u
+
+    (u, v), first = turned(stars.u, stars.v), mean + radius
+    # the product of both variances, without the cancellation in mean - radius
+    second = stars.var_u * var_v * (1.0 - rho) * (1.0 + rho) / first
+    off: dict[str, Any] = {}
+    if stars.off_u is not None and stars.off_v is not None:
+        off = dict(zip(("off_u", "off_v"), turned(stars.off_u, stars.off_v), strict=True))
+    return replace(stars, u=u, v=v, var_u=first, var_v=second, cos=c, sin=s, **off)
 
 
 def errors_of(matches: Matches) -> tuple[Float, Float]:
