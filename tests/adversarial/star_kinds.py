@@ -46,6 +46,21 @@ def inside_magnitudes(rng: np.random.Generator, n: int) -> Truth:
     return Truth(stars, true_map, order_config(3))
 
 
+@kind("inside_tilted", inside=True, quoted=True)
+@kind("tilted_as_round", *QUOTED, "axis", "axes", quoted=False)
+def tilted(rng: np.random.Generator, n: int, quoted: bool) -> Truth:
+    """Errors along u and v are correlated by 0.9 on one side of the detector, and by -0.9 on the
+    other; the table states it, or only the errors on both axes."""
+    true_map = mapped(fields.distortion(rng))
+    x, y = pixels(rng, n)
+    rho = np.where(x < fields.SIDE / 2, 0.9, -0.9)
+    a, b = rng.standard_normal((2, n))
+    noise = SIGMA * np.stack([a, rho * a + np.sqrt(1 - rho**2) * b], axis=1)
+    more = {"rho_uv": rho} if quoted else {}
+    stars = observed(rng, x, y, true_map(x, y, None), noise=noise, **more)
+    return Truth(stars, true_map, order_config(3))
+
+
 @kind("noise_corner", *QUOTED, "corner")
 def noise_corner(rng: np.random.Generator, n: int) -> Truth:
     """Errors are five times the quoted ones in one corner, a sixteenth of the detector."""

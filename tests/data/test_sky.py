@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from astropy import units as u
@@ -216,3 +218,72 @@ def test_a_catalogue_from_the_gaia_archive_needs_no_units(tmp_path):
     found = read_catalog(tmp_path / "gaia.csv", tangent_point=POINT)
     assert found.sigma_u == pytest.approx(0.3e-3, rel=1e-3)
     np.testing.assert_allclose(found.pm_v, np.asarray(catalogue()["pmdec"]) / 1e3, atol=5e-3)
+
+
+PARAMETERS = ("ra", "dec", "parallax", "pmra", "pmdec")
+
+
+def gaia_star(rng, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Errors (5,) in mas and years, and a correlation matrix (5, 5) with large elements."""
+    root = rng.standard_normal((5, 5)) + 1.5 * np.eye(5)[:, [1, 0, 3, 2, 4]]
+    C = root @ root.T
+    sigma = np.sqrt(np.diag(C))
+    return np.array([0.3, 0.2, 0.4, 0.15, 0.1]), C / np.outer(sigma, sigma)
+
+
+def gaia_table(values: np.ndarray, sigma=None, rho=None) -> Table:
+    """Rows of the archive (n, 5): degrees, mas, mas / yr, with errors and correlations."""
+    table = Table({"x": np.arange(len(values)) + 1.0, "y": np.full(len(values), 5.0)})
+    for name, column in zip(PARAMETERS, values.T, strict=True):
+        table[name] = column
+    table["ref_epoch"], table["phot_g_mean_mag"] = 2016.0, 15.0
+    if sigma is not None:
+        for i, name in enumerate(PARAMETERS):
+            table[f"{name}_error"] = sigma[i]
+            for j in range(i):
+                table[f"{PARAMETERS[j]}_{name}_corr"] = rho[i, j]
+    return table
+
+
+def test_all_correlations_of_gaia_come_to_the_epoch_of_the_exposure(rng):
+    """Against positions of many catalogues with such errors, each moved by itself."""
+    sigma, rho = gaia_star(rng, 1)
+    star, point = np.array([83.0, -5.0, 2.0, 30.0, -20.0]), (83.0, -5.0)
+    options = ReadOptions(tangent_point=point, epoch=2027.3)
+    [found] = (matches_from_table(gaia_table(star[None], sigma, rho), options),)
+    n = 20_000
+    error = rng.multivariate_normal(np.zeros(5), rho * np.outer(sigma, sigma), n)
+    error[:, 0] /= 3.6e6 * np.cos(np.radians(star[1]))
+    error[:, 1] /= 3.6e6
+    drawn = matches_from_table(gaia_table(star + error), replace(options, sigma=1.0))
+    C = np.cov(drawn.u, drawn.v)
+    assert found.sigma_u[0] == pytest.approx(np.sqrt(C[0, 0]), rel=0.02)
+    assert found.sigma_v[0] == pytest.approx(np.sqrt(C[1, 1]), rel=0.02)
+    expected = C[0, 1] / np.sqrt(C[0, 0] * C[1, 1])
+    assert found.rho_uv[0] == pytest.approx(expected, abs=4 / np.sqrt(n))
+    assert abs(expected) > 0.1
+
+
+def test_correlations_that_no_covariance_has_are_refused_with_their_row(rng):
+    sigma, rho = gaia_star(rng, 1)
+    table = gaia_table(np.tile([83.0, -5.0, 2.0, 30.0, -20.0], (3, 1)), sigma, rho)
+    options = ReadOptions(tangent_point=(83.0, -5.0), epoch=2027.3)
+    table["ra_dec_corr"] = [0.1, 0.2, 1.5]
+    with pytest.raises(InputError, match=r"row 3.*ra_dec_corr|ra_dec_corr.*row 3"):
+        matches_from_table(table, options)
+    table["ra_dec_corr"], table["ra_pmra_corr"], table["dec_pmra_corr"] = 0.99, 0.99, -0.99
+    with pytest.raises(InputError, match="contradict each other"):
+        matches_from_table(table, options)
+
+
+def test_correlations_of_matches_on_a_plane_are_read_and_checked():
+    table = Table({k: np.arange(1.0, 4.0) for k in "xyuv"})
+    table["sigma_u"], table["sigma_v"], table["rho_uv"] = 0.1, 0.2, [0.0, 0.9, -0.5]
+    found = matches_from_table(table, ReadOptions(unit="arcsec"))
+    assert found.rho_uv.tolist() == [0.0, 0.9, -0.5]
+    table["rho_uv"] = [0.0, 1.0, 0.2]
+    with pytest.raises(InputError, match="row 2"):
+        matches_from_table(table, ReadOptions(unit="arcsec"))
+    table.remove_columns(["sigma_u", "sigma_v"])
+    with pytest.raises(InputError, match="no errors"):
+        matches_from_table(table, ReadOptions(unit="arcsec"))

@@ -23,6 +23,8 @@ KINDS = {
     "uniform": kernel.UNIFORM,
 }
 
+NO_TURN = (np.zeros(0), np.zeros(0))  # errors that are not correlated
+
 
 def problem(kind: str, *, order=4, counts=(700, 1, 256, 333), draws=5, seed=1, far=0.0):
     """Stars of several groups, some blocks full, some not; and what they are in numpy."""
@@ -47,13 +49,13 @@ def problem(kind: str, *, order=4, counts=(700, 1, 256, 333), draws=5, seed=1, f
     out = rng.uniform(1, 20, draws) if kind == "gaussian" else np.full(draws, np.pi * 3.0**2)
     with np.errstate(divide="ignore"):
         constants = Constants(j2, np.log(f), np.log1p(-f), out, KINDS[kind], 0.2)
-    columns = tuple(np.ascontiguousarray(c) for c in (X, Y, u, v, var_u, var_v))
+    columns = tuple(np.ascontiguousarray(c) for c in (X, Y, u, v, var_u, var_v, *NO_TURN))
     return starts, columns, coef, order, constants, phi, group
 
 
 def plain(columns, coef, constants: Constants, phi, group) -> tuple[np.ndarray, np.ndarray]:
     """Log-likelihood and probability of being an outlier (D, N), each with a function of scipy."""
-    _, _, u, v, var_u, var_v = columns
+    _, _, u, v, var_u, var_v, *_ = columns
     loglik, p = [], []
     for c, j2, lf, l1f, out in zip(coef, *constants[:4], strict=True):
         ru, rv = (np.column_stack([u, v]) - np.einsum("nk,nak->na", phi, c[group])).T
@@ -113,7 +115,7 @@ def test_errors_that_differ_by_sixty_orders_of_magnitude(kind):
     rng = np.random.default_rng(8)
     n = len(phi)
     sigma = 10.0 ** rng.choice([-30.0, 0.0, 30.0], n) * rng.uniform(0.5, 2, (2, n))
-    columns = (*columns[:2], *(sigma * rng.standard_normal((2, n))), *sigma**2)
+    columns = (*columns[:2], *(sigma * rng.standard_normal((2, n))), *sigma**2, *NO_TURN)
     coef, constants = np.zeros_like(coef), constants._replace(j2=np.zeros(len(coef)))
     expected = plain(columns, coef, constants, phi, group)[0]
     found = run(starts, columns, coef, order, constants)

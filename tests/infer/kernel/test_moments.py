@@ -24,6 +24,7 @@ MIXTURES = {
     "gaussian, hardly any": ("gaussian", {"j": 1e-9, "f": 1e-12, "s_out": 0.6}),
     "uniform, hardly anything else": ("uniform", {"j": 0.5, "f": 1 - 1e-9}),
 }
+NO_TURN = (np.zeros(0), np.zeros(0))  # errors that are not correlated
 # full pieces and blocks, remnants of them, and a single star
 COUNTS = (9001, 1, 256, 700)
 
@@ -60,7 +61,7 @@ class Stars:
 
     @property
     def columns(self) -> tuple[np.ndarray, ...]:
-        columns = (self.X, self.Y, *self.data.T, *(self.sigma**2).T)
+        columns = (self.X, self.Y, *self.data.T, *(self.sigma**2).T, *NO_TURN)
         return tuple(np.ascontiguousarray(c) for c in columns)
 
     @property
@@ -210,7 +211,7 @@ def test_the_corner_weight_is_what_it_says():
     X, Y = np.array([[0.0, 0], [1, 1], [-1, 1], [1, -1], [-1, -1], [1, 0], [0, -1]]).T
     one = np.ones(1)
     for x, y, factor in zip(X, Y, [1, 5, 5, 5, 5, 3, 3], strict=True):
-        columns = (np.array([x]), np.array([y]), one, one, 4 * one, 9 * one)
+        columns = (np.array([x]), np.array([y]), one, one, 4 * one, 9 * one, *NO_TURN)
         nothing = np.zeros((1, 2, 3))
         found = kernel.least_squares_moments(
             np.array([[0, 0, 1]]),

@@ -83,13 +83,16 @@ def terms_of(mixture: OutlierMixture, values, residual, var_u, var_v) -> StarTer
     )
 
 
+NO_TURN = (np.zeros(0), np.zeros(0))  # errors that are not correlated
+
+
 def by_kernel(hyper, values, residual, sigma) -> tuple[np.ndarray, np.ndarray]:
     """Outlier probability and log-likelihood of each star by the compiled pass.
 
     The model is zero: the residuals are the data.
     """
     n = len(residual)
-    columns = (np.zeros(n), np.zeros(n), *residual.T, *(sigma**2).T)
+    columns = (np.zeros(n), np.zeros(n), *residual.T, *(sigma**2).T, *NO_TURN)
     p, loglik, _ = kernel.memberships(
         kernel.pieces_of(np.array([0, n]), kernel.BLOCK),
         tuple(np.ascontiguousarray(c) for c in columns),
@@ -180,7 +183,7 @@ def test_extreme_residuals_stay_finite(hyper):
     np.testing.assert_allclose(p[:2], far, atol=1e-12)
     moments = kernel.mixture_moments(
         np.array([[0, 0, 3]]),
-        (np.zeros(3), np.zeros(3), *np.ascontiguousarray(residual.T), *(sigma.T.copy() ** 2)),
+        (*np.zeros((2, 3)), *np.ascontiguousarray(residual.T), *(sigma.T.copy() ** 2), *NO_TURN),
         np.zeros((1, 2, 3)),
         1,
         hyper.constants(hyper.point(values)[None]),
