@@ -115,8 +115,8 @@ def reference_sky(
     """Reference positions at `epoch`, with errors and motions if the table has them.
 
     `epoch` (N,) is the epoch of the exposures, and `catalogue_epoch` that of the reference
-    positions, used if the table has no such column; both are decimal years. Besides ra and dec, these columns are used if they exist: sigma_ra, sigma_dec,
-    pm_ra, pm_dec and their errors, parallax and its error, and the correlations of all these
+    positions, used if the table has no such column; both are decimal years. Besides ra and dec,
+    these columns are used if they exist: sigma_ra, sigma_dec, pm_ra, pm_dec and their errors, parallax and its error, and the correlations of all these
     (`CORRELATIONS`). Raises InputError for half a pair, and for missing or invalid units.
     """
     ra, dec = sky_columns(quantities)
@@ -512,9 +512,10 @@ def onto_plane(
     """Arguments of `Matches` for stars on a tangent plane, in arcsec.
 
     They are u, v and tangent_point, rho_uv, and the columns sigma, pm and sigma_pm for u and v if
-    these are given.  `ra`, `dec` (N,) and `point` are in degrees; the default point is the mean direction. Errors,
-    motions and their errors (2, N) are to the east (with the factor cos(dec)) and to the north, in
-    arcsec (per year); `rho` (N,) is the correlation of the errors of positions.
+    these are given.  `ra`, `dec` (N,) and `point` are in degrees; the default point is the mean
+    direction.  Errors, motions and their errors (2, N) are to the east (with the factor cos(dec))
+    and to the north, in arcsec (per year); `rho` (N,) is the correlation of the errors of
+    positions.
     """
     point = mean_direction(ra, dec) if point is None else point
     u, v = tangent_plane(ra, dec, point, where=where, place=place)
