@@ -117,7 +117,8 @@ def reference_sky(
     `epoch` (N,) is the epoch of the exposures, and `catalogue_epoch` that of the reference
     positions, used if the table has no such column; both are decimal years. Besides ra and dec,
     these columns are used if they exist: sigma_ra, sigma_dec, pm_ra, pm_dec and their errors,
-    parallax and its error, and the correlations of all these (`CORRELATIONS`). Raises InputError for half a pair, and for missing or invalid units.
+    parallax and its error, and the correlations of all these (`CORRELATIONS`).
+    Raises InputError for half a pair, and for missing or invalid units.
     """
     ra, dec = sky_columns(quantities)
     _pair(quantities, ("sigma_ra", "sigma_dec"), "arcsec")
