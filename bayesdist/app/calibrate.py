@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import tomli_w
 
-from bayesdist.app.artefacts.reader import StarReader
+from bayesdist.app.artefacts.stars import StarReader
 from bayesdist.app.config import MatchesConfig, parse_config
 from bayesdist.app.config.assess import RequirementBlock
 from bayesdist.app.kinds.matches.stars import read_stars

@@ -14,9 +14,8 @@ from typing import TYPE_CHECKING, Any, Self, TypeAlias, TypeVar
 import numpy as np
 
 from bayesdist.app import hooks
-from bayesdist.app.artefacts.errors import QUOTED, ErrorLaw
 from bayesdist.app.artefacts.parts import NO_TABLES, Part, StoredLookupTables
-from bayesdist.app.artefacts.reader import RunInput, StarReader
+from bayesdist.app.artefacts.stars import QUOTED, ErrorLaw, RunInput, StarReader
 from bayesdist.app.python_terms import python_terms
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.tables.result_files import load_diagnostics, load_evaluation

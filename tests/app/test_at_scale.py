@@ -116,7 +116,7 @@ def test_no_stage_takes_all_rows_into_memory(job, tmp_path, on_disk, monkeypatch
     monkeypatch.setattr(
         Matches, "_complete", lambda self: (sizes.append(np.size(self.x)), complete(self))[1]
     )
-    for name in ("artefacts.reader", "kinds.matches.stars", "report"):
+    for name in ("artefacts.stars", "kinds.matches.stars", "report"):
         monkeypatch.setattr(f"bayesdist.app.{name}.SAMPLE", 900, raising=False)
     monkeypatch.setattr("bayesdist.infer.solution.linear.MEDIAN_STARS", 900)
     good("init", tmp_path / "c.toml", "--matches", job.parent / "stars")

@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bayesdist.app.artefacts.errors import ErrorLaw
-from bayesdist.app.artefacts.reader import StarReader
+from bayesdist.app.artefacts.stars import ErrorLaw, StarReader
 from bayesdist.app.artefacts.stored_fit import read_stored_fit, write_stored_fit
 from bayesdist.app.pipeline import fit, match, sample
 from bayesdist.app.run import Run

@@ -48,7 +48,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bayesdist.app.kinds.kind import RunKind
-from bayesdist.app.artefacts.holdout import set_aside
+from bayesdist.app.artefacts.stars import set_aside
 from bayesdist.app.artefacts.parts import Part
 from bayesdist.app.artefacts.stored_fit import read_stored_fit
 from bayesdist.assess.terms.parameters import ScaleError

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import bayesdist as bd
-from bayesdist.app.artefacts.errors import QUOTED
+from bayesdist.app.artefacts.stars import QUOTED
 from bayesdist.app.assessment.evaluating import margins_of_run
 from bayesdist.app.config import parse_config
 from bayesdist.app.config.assess import BudgetBlock

@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from bayesdist.app.artefacts.errors import ErrorLaw
 from bayesdist.app.artefacts.parts import StoredLookupTables
+from bayesdist.app.artefacts.stars import ErrorLaw
 from bayesdist.app.kinds.campaign.report import _residuals
 from bayesdist.data import Matches
 from bayesdist.diagnose.overlap import _at_first_epoch, align, chosen_exposures

@@ -8,8 +8,8 @@ from typing import Any
 
 from astropy.table import Table
 
-from bayesdist.app.artefacts.errors import ErrorLaw
 from bayesdist.app.artefacts.parts import Part
+from bayesdist.app.artefacts.stars import ErrorLaw
 from bayesdist.app.store.output import write_table
 from bayesdist.errors import InputError
 from bayesdist.files.faults import restoring

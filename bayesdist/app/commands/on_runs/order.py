@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.app.artefacts.errors import QUOTED
+from bayesdist.app.artefacts.stars import QUOTED
 from bayesdist.app.config import MatchesConfig, load_config
 from bayesdist.app.kinds.matches.stars import model_of, shards_of
 from bayesdist.app.run import Run

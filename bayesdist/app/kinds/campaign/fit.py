@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from bayesdist.app.artefacts.errors import ErrorLaw
+from bayesdist.app.artefacts.stars import ErrorLaw
 from bayesdist.app.kinds.campaign.input_validation import frames_not_set
 from bayesdist.app.kinds.campaign.inputs import Inputs
 from bayesdist.app.kinds.campaign.linear_terms import FIXED, gap_priors, line_sections, with_gap

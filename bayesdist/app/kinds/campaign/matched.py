@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.app.artefacts.holdout import set_aside
 from bayesdist.app.artefacts.parts import Part
+from bayesdist.app.artefacts.stars import set_aside
 from bayesdist.app.config import CampaignConfig
 from bayesdist.app.kinds.campaign.inputs import Inputs
 from bayesdist.app.kinds.star_lists import known_calibration

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bayesdist.app.artefacts.reader import RunInput
+from bayesdist.app.artefacts.stars import RunInput
 from bayesdist.app.config import ChipBlock, Data, MatchesConfig
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data import Matches, input_files, open_matches, read_matches

@@ -7,9 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
-from bayesdist.app.artefacts.errors import QUOTED, ErrorLaw
-from bayesdist.app.artefacts.holdout import set_aside
-from bayesdist.app.artefacts.reader import StarReader
+from bayesdist.app.artefacts.stars import QUOTED, ErrorLaw, StarReader, set_aside
 from bayesdist.app.artefacts.stored_fit import (
     FIT,
     converged_posterior,

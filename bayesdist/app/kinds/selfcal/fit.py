@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.app.artefacts.errors import ErrorLaw
+from bayesdist.app.artefacts.stars import ErrorLaw
 from bayesdist.app.artefacts.stored_fit import FIT_AGAIN, read_stored_fit
 from bayesdist.app.kinds.selfcal.gauge import fixed_by, gauge_summary, gauge_table, gauge_words
 from bayesdist.app.kinds.selfcal.inputs import Inputs
