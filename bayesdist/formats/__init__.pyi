@@ -25,5 +25,5 @@ from .lookup.npol import (
 )
 from .sip.build import sip_from_solution as sip_from_solution
 from .sip.header import SipHeader as SipHeader
-from .sip.read import read_sip as read_sip
-from .sip.write import write_sip as write_sip
+from .sip.files import read_sip as read_sip
+from .sip.files import write_sip as write_sip

@@ -214,11 +214,11 @@ def test_two_chips_have_a_header_each(tmp_path, rng) -> None:
 
 def test_a_header_that_is_off_is_called_wrong(tmp_path, rng, monkeypatch) -> None:
     """CRVAL moved by ten pixels on its way to the file."""
-    from bayesdist.formats.sip import format, write
+    from bayesdist.formats.sip import files, format
 
     def moved(sip):
         off = replace(sip, crval=(sip.crval[0], sip.crval[1] + 10 * PIXEL / 3600))
-        return write.sip_text(off)
+        return files.sip_text(off)
 
     monkeypatch.setattr(format, "sip_text", moved)
     run = made(tmp_path, camera((83.8, -5.4), -1), rng)

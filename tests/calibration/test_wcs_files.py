@@ -8,7 +8,7 @@ from astropy.io import fits
 from astropy.wcs import WCS
 from numpy.testing import assert_allclose
 
-from bayesdist.formats.sip.write import sip_header, write_sip
+from bayesdist.formats.sip.files import sip_header, write_sip
 from bayesdist.products import read_calibration
 
 from ..formats.test_tpv import SCAMP_SIZE, scamp_head

@@ -13,7 +13,7 @@ from bayesdist.errors import FormatError, InputError
 from bayesdist.formats.idctab.build import idctab_from_solution
 from bayesdist.formats.idctab.table import read_idctab, write_idctab
 from bayesdist.formats.sip.build import sip_from_solution
-from bayesdist.formats.sip.write import write_sip
+from bayesdist.formats.sip.files import write_sip
 from bayesdist.products import describe
 
 from .support import F606W, some_solution, wfc_solution

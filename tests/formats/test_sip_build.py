@@ -14,9 +14,9 @@ from bayesdist.calibration.plane import ARCSEC
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.formats.idctab.table import read_idctab
 from bayesdist.formats.sip.build import sip_from_solution
+from bayesdist.formats.sip.files import sip_header
 from bayesdist.formats.sip.header import worst_closure
 from bayesdist.formats.sip.lint import lint_sip
-from bayesdist.formats.sip.write import sip_header
 from bayesdist.missions.wise.published import WISE_COEFFICIENTS
 from bayesdist.missions.wise.simulate import wise_solution
 from bayesdist.model import Chip, DistortionModel, TimeDependence

@@ -14,8 +14,7 @@ from numpy.testing import assert_allclose
 
 from bayesdist.errors import FormatError, InputError
 from bayesdist.formats.sip.build import sip_from_solution
-from bayesdist.formats.sip.read import read_sip
-from bayesdist.formats.sip.write import sip_header, write_sip
+from bayesdist.formats.sip.files import read_sip, sip_header, write_sip
 
 from .support import astropy_wcs, random_pixels, some_solution
 

@@ -15,10 +15,9 @@ from numpy.testing import assert_allclose
 
 from bayesdist.errors import InputError
 from bayesdist.formats.sip.build import sip_from_solution
+from bayesdist.formats.sip.files import read_sip, sip_header, write_sip
 from bayesdist.formats.sip.lint import lint_sip
-from bayesdist.formats.sip.read import read_sip
 from bayesdist.formats.sip.rotate import coefficient_map, pixel_matrix, rotated_sip
-from bayesdist.formats.sip.write import sip_header, write_sip
 from bayesdist.model.basis import polynomial_terms
 
 from .support import astropy_wcs, random_pixels, some_solution

@@ -11,9 +11,8 @@ from numpy.testing import assert_allclose
 import bayesdist as bd
 from bayesdist.errors import InputError
 from bayesdist.formats.sip.build import sip_from_solution
+from bayesdist.formats.sip.files import read_sip, sip_header, write_sip
 from bayesdist.formats.sip.lint import lint_sip
-from bayesdist.formats.sip.read import read_sip
-from bayesdist.formats.sip.write import sip_header, write_sip
 from bayesdist.infer import load_fit, save_fit
 
 from .support import StandIn, astropy_wcs, random_pixels, some_solution

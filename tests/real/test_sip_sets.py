@@ -12,10 +12,9 @@ from scipy import stats
 
 from bayesdist.calibration.inverse import detector_grid, fit_inverse
 from bayesdist.formats.sip.build import sip_from_solution
+from bayesdist.formats.sip.files import read_sip, sip_header, write_sip
 from bayesdist.formats.sip.header import worst_closure
-from bayesdist.formats.sip.read import read_sip
 from bayesdist.formats.sip.rotate import pixel_matrix, rotated_sip
-from bayesdist.formats.sip.write import sip_header, write_sip
 from bayesdist.missions.wise.simulate import wise_solution
 from tests.reduced import only_in_full
 

@@ -15,9 +15,14 @@ from bayesdist.calibration.orientation import MAX_DEPARTURE, departure_from_tang
 from bayesdist.calibration.plane import ARCSEC, arcsec_per
 from bayesdist.calibration.sky import reprojected
 from bayesdist.errors import InputError
-from bayesdist.formats.sip.families import offset_ranges
-from bayesdist.formats.sip.header import LINEAR_AXES, SIP_ORDERS, SipHeader, worst_closure
-from bayesdist.formats.sip.write import sip_header
+from bayesdist.formats.sip.files import sip_header
+from bayesdist.formats.sip.header import (
+    LINEAR_AXES,
+    SIP_ORDERS,
+    SipHeader,
+    offset_ranges,
+    worst_closure,
+)
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.model import DistortionModel
 from bayesdist.products.common.cards import (

@@ -1,7 +1,8 @@
-"""Calibration of SIP headers, alone or with their parameter files."""
+"""Calibration of SIP headers, alone or with their parameter files, and positions from them."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,18 +11,20 @@ import numpy as np
 from bayesdist.calibration.calibration import Calibration, calibration_of_maps
 from bayesdist.calibration.chip_map import fitted_map, refuse_order
 from bayesdist.calibration.inverse import detector_grid
-from bayesdist.calibration.plane import ARCSEC, Plane
+from bayesdist.calibration.plane import ARCSEC, Plane, arcsec_per
 from bayesdist.data.sky import sky_of_plane, tangent_plane
+from bayesdist.formats.sip.files import sip_header, sip_of
 from bayesdist.formats.sip.header import SIDE_FILE, SIP_ORDERS, SipHeader
-from bayesdist.formats.sip.write import sip_header
 from bayesdist.model import polynomial_terms
 from bayesdist.products.common.cards import text_card
-from bayesdist.products.common.celestial import refuse_singular, tangent_form
-from bayesdist.products.common.document import PARAMETERS, Built, required_size
+from bayesdist.products.common.celestial import refuse_singular, sky_of_header, tangent_form
+from bayesdist.products.common.content import Content
+from bayesdist.products.common.document import PARAMETERS, BuildOptions, Built, required_size
 from bayesdist.products.common.parameters import (
     parameters_content,
     refuse_other,
 )
+from bayesdist.products.common.read_back import ReadBack
 from bayesdist.utils.arrays import Float
 
 NO_LINEAR_ERRORS = (
@@ -149,3 +152,78 @@ def _difference(found: Calibration, stored: Calibration) -> float:
     design = np.stack([np.ones_like(w), w], axis=1)
     residual = design @ np.linalg.lstsq(design, z, rcond=None)[0] - z
     return float(np.abs(residual).max() / pixel)
+
+
+# -- positions as users of the headers obtain them ------------------------------------------------
+
+
+def sip_positions(
+    sip: SipHeader,
+    x: Float,
+    y: Float,
+    *,
+    unit: str,
+    scale_arcsec: float | None,
+    like: SipHeader | None = None,
+    tangent_point: tuple[float, float] | None = None,
+) -> Float:
+    """(u, v) of FITS 1-based pixels (N,) computed from the forward terms of a header, shape (N, 2).
+
+    For u and v in pixels, `scale_arcsec` is the pixel scale with which the header was made. `like`
+    provides CD and zero point for a file that states neither. With a `tangent_point` (sky position
+    of u, v = 0), positions are computed through the sky, as in astropy.wcs.
+    """
+    if tangent_point is not None:
+        plane = tangent_plane(*sky_of_header(sip_header(sip), x, y), tangent_point)
+        return np.stack(plane, axis=-1) / ARCSEC[unit]
+    stated = like or sip
+    if stated.linear_axes:
+        return np.stack(sip.forward(x, y), axis=-1) @ stated.cd.T + stated.crval
+    in_unit = 3600.0 / arcsec_per(unit, scale_arcsec)
+    offset = stated.offset or (0.0, 0.0)
+    return np.stack(sip.forward(x, y), axis=-1) @ (in_unit * stated.cd).T + offset
+
+
+def sip_read_back(
+    files: Sequence[Built], calibration: Calibration, options: BuildOptions
+) -> list[ReadBack]:
+    """Positions from the headers of the chips, on the sky if the calibration has a sky plane."""
+    headers = {
+        built.chip: sip_of(Content(built.file_name, built.content))
+        for built in files
+        if built.chip is not None and built.kind != PARAMETERS
+    }
+    names = ", ".join(built.file_name for built in files if built.kind != PARAMETERS)
+    point = calibration.plane.point
+    return [headers_read_back(names, headers, calibration, options, tangent_point=point)]
+
+
+def headers_read_back(
+    file: str,
+    headers: Mapping[int, SipHeader],
+    calibration: Calibration,
+    options: BuildOptions,
+    *,
+    like: SipHeader | None = None,
+    tangent_point: tuple[float, float] | None = None,
+) -> ReadBack:
+    """Positions from one header per chip; for `like` and `tangent_point` see `sip_positions`."""
+    unit = calibration.model.unit
+
+    def forward(x: Float, y: Float, chip: int, _: float | None) -> Float:
+        return sip_positions(
+            headers[chip],
+            x,
+            y,
+            unit=unit,
+            scale_arcsec=options.scale_arcsec,
+            like=like,
+            tangent_point=tangent_point,
+        )
+
+    def missed(x: Float, y: Float, chip: int, _: float | None) -> Float:
+        sip = headers[chip]
+        back_x, back_y = sip.inverse(*sip.forward(x, y))
+        return np.stack([back_x - x, back_y - y], axis=-1)
+
+    return ReadBack(file, forward, missed)

@@ -11,8 +11,9 @@ from numpy.polynomial import legendre
 from numpy.typing import ArrayLike
 
 from bayesdist.errors import InputError
-from bayesdist.formats.sip.families import (
+from bayesdist.formats.sip.header import (
     EDGE,
+    SipHeader,
     families,
     forward_is_used,
     half_unit,
@@ -21,7 +22,6 @@ from bayesdist.formats.sip.families import (
     repeated_names,
     with_coefficient,
 )
-from bayesdist.formats.sip.header import SipHeader
 from bayesdist.model.basis import polynomial_terms
 from bayesdist.products.common.coefficients import evaluate, sip_keyword
 from bayesdist.utils.arrays import Bool, Float

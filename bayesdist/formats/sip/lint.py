@@ -8,8 +8,11 @@ from dataclasses import replace
 import numpy as np
 
 from bayesdist.calibration.plausible import FAR
-from bayesdist.formats.sip.families import (
+from bayesdist.formats.sip.header import (
     EDGE,
+    SIDE_FILE,
+    SIP_ORDERS,
+    SipHeader,
     families,
     forward_is_used,
     half_unit,
@@ -18,8 +21,8 @@ from bayesdist.formats.sip.families import (
     repeated_names,
     values_by_keyword,
     with_coefficient,
+    worst_closure,
 )
-from bayesdist.formats.sip.header import SIDE_FILE, SIP_ORDERS, SipHeader, worst_closure
 from bayesdist.formats.sip.implied import implied_values, with_error
 from bayesdist.products.common.coefficients import largest_magnitude, sip_keyword
 from bayesdist.products.common.document import Finding

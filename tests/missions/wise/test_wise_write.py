@@ -15,8 +15,7 @@ from numpy.polynomial import polynomial
 from bayesdist.data import Matches
 from bayesdist.errors import FormatError, InputError
 from bayesdist.formats.sip.build import sip_from_solution
-from bayesdist.formats.sip.read import read_sip
-from bayesdist.formats.sip.write import sip_header, write_sip
+from bayesdist.formats.sip.files import read_sip, sip_header, write_sip
 from bayesdist.infer import fit_linear
 from bayesdist.missions.wise.meta_data.build import write_wise_meta
 from bayesdist.missions.wise.meta_data.lint import lint_wise_band

@@ -15,8 +15,14 @@ import numpy as np
 
 from bayesdist.errors import InputError
 from bayesdist.files.atomic import atomic_path
-from bayesdist.formats.sip.families import EDGE, families, offset_ranges
-from bayesdist.formats.sip.header import SIP_ORDERS, SipHeader, worst_closure
+from bayesdist.formats.sip.header import (
+    EDGE,
+    SIP_ORDERS,
+    SipHeader,
+    families,
+    offset_ranges,
+    worst_closure,
+)
 from bayesdist.missions.wise.meta_data.meta import ARRAYS, monomial
 from bayesdist.model.basis import polynomial_terms
 from bayesdist.products.common.coefficients import largest_magnitude, sip_keyword

@@ -9,9 +9,9 @@ from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.plane import Plane
 from bayesdist.errors import InputError
 from bayesdist.formats.sip.build import sip_from_solution
+from bayesdist.formats.sip.calibration import headers_read_back
+from bayesdist.formats.sip.format import coefficient_lines
 from bayesdist.formats.sip.header import SIP_ORDERS, worst_closure
-from bayesdist.formats.sip.positions import headers_read_back
-from bayesdist.formats.sip.text import coefficient_lines
 from bayesdist.missions.wise.meta_data.build import wise_text
 from bayesdist.missions.wise.meta_data.lint import lint_wise_band
 from bayesdist.missions.wise.meta_data.meta import (

@@ -6,14 +6,14 @@ import re
 from collections import Counter
 from collections.abc import Iterator
 
-from bayesdist.formats.sip.families import (
+from bayesdist.formats.sip.header import (
+    SipHeader,
     families,
     forward_is_used,
     inverse_is_used,
     offset_ranges,
     powers_of,
 )
-from bayesdist.formats.sip.header import SipHeader
 from bayesdist.formats.sip.implied import StatedMaxima, implied_values
 from bayesdist.formats.sip.lint import lint_sip
 from bayesdist.missions.wise.meta_data.meta import WiseBand, monomial

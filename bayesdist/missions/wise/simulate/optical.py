@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from bayesdist.errors import InputError
+from bayesdist.formats.sip.files import write_sip
 from bayesdist.formats.sip.header import SipHeader
-from bayesdist.formats.sip.write import write_sip
 from bayesdist.missions.wise.published import WISE_ARRAYS
 from bayesdist.missions.wise.simulate import wise_solution
 from bayesdist.model import DistortionModel
