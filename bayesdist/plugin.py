@@ -48,6 +48,9 @@ class Mission:
     error_terms: Mapping[str, str] = field(default_factory=dict)
     # sets of files for [products.release]: each a `bayesdist.app.products.release_set.ReleaseSet`
     releases: Mapping[str, str] = field(default_factory=dict)
+    # further checks of files, by the key of their format, which defines the arguments: for "sip" a
+    # `bayesdist.formats.sip.lint.Explanation`
+    checks: Mapping[str, str] = field(default_factory=dict)
     # module that registers figures and tables with `bayesdist.report.contents.REPORT`
     report: str = ""
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -20,10 +20,8 @@ from bayesdist.formats.sip.header import (
     offset_ranges,
     repeated_names,
     values_by_keyword,
-    with_coefficient,
     worst_closure,
 )
-from bayesdist.formats.sip.implied import implied_values, with_error
 from bayesdist.products.common.coefficients import largest_magnitude, sip_keyword
 from bayesdist.products.common.document import Finding
 
@@ -35,15 +33,16 @@ _CLOSURE_RELATIVE = 1e-2
 # No program computes with A_DMAX, so a rough value does no harm; a wrong one suggests that it
 # belongs to another header.
 _DMAX_ROUGH = 0.1
-# A single coefficient is blamed if its correct value reduces the closure to this fraction.
-_EXPLAINED = 0.2
-# Smallest probability of further suspects that are named after the first one.
-_WORTH_NAMING = 0.05
-# Relative tolerance at which two numbers count as equal except for a mistyped sign.
-_SAME_SIZE = 0.05
+
+# ``explain(sip, size, closure)`` yields findings on the coefficient that explains a closure; pixels
+Explanation = Callable[[SipHeader, tuple[int, int], float], Iterable[Finding]]
 
 
-def lint_sip(sip: SipHeader, size: tuple[int, int] | None = None) -> tuple[Finding, ...]:
+def lint_sip(
+    sip: SipHeader,
+    size: tuple[int, int] | None = None,
+    explain: Explanation | None = None,
+) -> tuple[Finding, ...]:
     """Check a SIP header against the behaviour of astropy.wcs, stwcs and gwcs.
 
     Parameters
@@ -53,6 +52,9 @@ def lint_sip(sip: SipHeader, size: tuple[int, int] | None = None) -> tuple[Findi
     size : tuple of int, optional
         Columns and rows of the detector. The default is the size in the header. Without either,
         checks that need the size are left out, with a note.
+    explain : callable, optional
+        ``explain(sip, size, closure)`` yields findings on the coefficient that explains why AP, BP
+        are not the inverse of A, B. The largest difference is `closure` in pixels.
 
     Returns
     -------
@@ -74,7 +76,7 @@ def lint_sip(sip: SipHeader, size: tuple[int, int] | None = None) -> tuple[Findi
             )
         )
     elif forward_is_used(sip):
-        findings += [*_dmax(sip, size), *_inverse(sip, size)]
+        findings += [*_dmax(sip, size), *_inverse(sip, size, explain)]
     return tuple(findings)
 
 
@@ -183,7 +185,9 @@ def _dmax(sip: SipHeader, size: tuple[int, int]) -> Iterator[Finding]:
             )
 
 
-def _inverse(sip: SipHeader, size: tuple[int, int]) -> Iterator[Finding]:
+def _inverse(
+    sip: SipHeader, size: tuple[int, int], explain: Explanation | None
+) -> Iterator[Finding]:
     if sip.inverse_order is None:
         yield Finding("note", "AP_ORDER", "there is no inverse: programs must iterate")
         return
@@ -203,14 +207,14 @@ def _inverse(sip: SipHeader, size: tuple[int, int]) -> Iterator[Finding]:
             f"index order: p and q are exchanged against A and B (closure {closure:.3g} px)",
         )
     elif closure > _CLOSURE_GOOD:
-        accused = list(_accused(sip, size, closure))
-        yield from accused
+        explained = [] if explain is None else list(explain(sip, size, closure))
+        yield from explained
         if closure > _CLOSURE_BAD:
             yield Finding(
                 "error", keywords, f"they miss the inverse of A, B by up to {closure:.3g} px: "
                 "a coefficient of one or the other is wrong",
             )  # fmt: skip
-        elif not accused:
+        elif not explained:
             advice = (
                 "raise AP_ORDER" if max(sip.inverse_order) < SIP_ORDERS[1] else "better iterate"
             )
@@ -223,29 +227,3 @@ def _inverse(sip: SipHeader, size: tuple[int, int]) -> Iterator[Finding]:
         yield Finding(
             "error", "BDCLOS", f"states {sip.closure:.3g} px, and AP, BP leave {closure:.3g} px"
         )
-
-
-def _accused(sip: SipHeader, size: tuple[int, int], closure: float) -> Iterator[Finding]:
-    """Findings on a wrong coefficient, if its correct value alone makes A, B and AP, BP agree."""
-    suspects = implied_values(sip, size)
-    first = suspects[0]
-    remaining = worst_closure(with_coefficient(sip, first.keyword, first.value), size)
-    if remaining > _EXPLAINED * closure:
-        return
-    low, high = first.interval
-    message = (
-        f"is {first.printed:.7g}, and {' and '.join(first.sources)} imply {with_error(first)} "
-        f"(95 %: {low:.7g} to {high:.7g}; closure then {remaining:.2g} px)"
-    )
-    if abs(first.printed + first.value) < _SAME_SIZE * abs(first.value):
-        message += "; the sign is wrong"
-    for names in repeated_names(sip):
-        if first.keyword in names:
-            repeated = " and ".join(n for n in names if n != first.keyword)
-            message += f"; what stands there is the value of {repeated}"
-    rivals = [suspect for suspect in suspects[1:] if suspect.probability > _WORTH_NAMING]
-    for rival in rivals:
-        message += f"; or {rival.keyword} should be {with_error(rival)}"
-    if rivals:
-        message += "; these numbers alone do not tell which"
-    yield Finding("error", first.keyword, message)

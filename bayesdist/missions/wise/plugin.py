@@ -19,6 +19,7 @@ PLUGIN = Plugin(
             simulate={"wise": f"{_COMMANDS}:simulate"},
             data_sections={"rvb": f"{_PAIRS}.section:RvbData"},
             match_sources={"rvb": f"{_PAIRS}.run_input:SOURCE"},
+            checks={"sip": "bayesdist.missions.wise.meta_data.implied:wrong_coefficient"},
             beside_core={"demo": f"{_COMMANDS}:demo"},
         )
     },

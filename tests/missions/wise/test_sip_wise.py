@@ -15,12 +15,13 @@ from scipy import stats
 
 from bayesdist.calibration.inverse import fit_inverse
 from bayesdist.errors import FormatError, InputError
+from bayesdist.formats.sip.files import write_sip
 from bayesdist.formats.sip.header import worst_closure
-from bayesdist.formats.sip.implied import implied_values
 from bayesdist.formats.sip.lint import lint_sip
+from bayesdist.missions.wise.meta_data.implied import implied_values, wrong_coefficient
 from bayesdist.missions.wise.meta_data.lint import lint_wise_band
 from bayesdist.missions.wise.meta_data.meta import read_wise_meta
-from bayesdist.products import describe
+from bayesdist.products import describe, lint
 from bayesdist.products.common.coefficients import evaluate, largest_magnitude
 from tests.reduced import case_in_full, only_in_full
 
@@ -209,15 +210,24 @@ def test_only_w1_has_a_wrong_coefficient(bands) -> None:
 
 def test_the_copied_coefficient_of_w1_is_found_three_ways(bands) -> None:
     sip = bands[1].sip
-    text = "\n".join(said(lint_sip(sip)))
+    text = "\n".join(said(lint_sip(sip, explain=wrong_coefficient)))
     assert "warning: B_1_1, B_0_2: the same value, 3.541684e-06" in text
     assert "warning: B_DMAX: says 1.066 px" in text
     assert "error: AP, BP: they miss the inverse" in text
     # the published inverse says what it must be, but for terms of second order in the distortion
-    right = lint_sip(with_b_0_2(sip, -sip.bp[0, 2]))
+    right = lint_sip(with_b_0_2(sip, -sip.bp[0, 2]), explain=wrong_coefficient)
     assert said(right, "error") == said(right, "warning") == []
     low = "A_0_0, A_1_0, A_0_1, B_0_0, B_1_0, B_0_1: constant or linear terms"
     assert any(low in text for text in said(right, "note"))
+
+
+def test_the_checks_of_sip_headers_name_the_wrong_coefficient(bands, tmp_path) -> None:
+    """The format finds the check by the plugin; without it, only the closure is reported."""
+    write_sip(bands[1].sip, tmp_path / "w1.hdr")
+    [wrong, closure] = said(lint(tmp_path / "w1.hdr"), "error")
+    assert wrong.startswith("error: B_0_2: is -3.541684e-06, and AP, BP and B_DMAX imply +1.16")
+    assert said(lint_sip(bands[1].sip), "error") == [closure]
+    assert closure.startswith("error: AP, BP: they miss the inverse")
 
 
 def test_b_0_2_of_w1_is_positive_and_satisfies_all_that_was_printed(bands) -> None:
@@ -388,7 +398,7 @@ def test_a_changed_sign_is_found(bands, band: int, keyword: str) -> None:
     # those of odd degree are biased in the printed inverses, by up to 2 % in W4
     assert abs(one.value - terms[key]) < 0.05 * abs(terms[key])
     assert any("sign is wrong" in text or f"or {keyword} should" in text
-               for text in said(lint_sip(wrong), "error"))  # fmt: skip
+               for text in said(lint_sip(wrong, explain=wrong_coefficient), "error"))  # fmt: skip
 
 
 def test_an_inverse_of_too_low_an_order_accuses_nobody(bands) -> None:
@@ -396,8 +406,11 @@ def test_an_inverse_of_too_low_an_order_accuses_nobody(bands) -> None:
     ap, bp = fit_inverse(sip.forward, sip.crpix, sip.size, 2)
     low = replace(sip, inverse_order=(2, 2), ap=ap, bp=bp)
     assert worst_closure(low, sip.size) > 0.01
-    assert said(lint_sip(low), "error") == []
-    assert any("raise AP_ORDER" in text for text in said(lint_sip(low), "warning"))
+    assert said(lint_sip(low, explain=wrong_coefficient), "error") == []
+    assert any(
+        "raise AP_ORDER" in text
+        for text in said(lint_sip(low, explain=wrong_coefficient), "warning")
+    )
 
 
 def test_nothing_is_implied_without_an_inverse(bands) -> None:
@@ -412,7 +425,7 @@ def test_a_header_that_says_nothing_implies_nothing_wrong(bands) -> None:
     zero = dict.fromkeys(bands[2].sip.a, 0.0)
     sip = replace(bands[2].sip, a=zero, b=zero, ap=zero, bp=zero, dmax=(0.0, 0.0))
     assert all(abs(one.value) <= 4 * one.sigma for one in implied_values(sip))
-    assert said(lint_sip(sip), "error") == []
+    assert said(lint_sip(sip, explain=wrong_coefficient), "error") == []
 
 
 def test_a_missing_coefficient_and_a_skew_are_reported(tmp_path) -> None:

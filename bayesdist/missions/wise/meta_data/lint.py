@@ -14,8 +14,12 @@ from bayesdist.formats.sip.header import (
     offset_ranges,
     powers_of,
 )
-from bayesdist.formats.sip.implied import StatedMaxima, implied_values
 from bayesdist.formats.sip.lint import lint_sip
+from bayesdist.missions.wise.meta_data.implied import (
+    StatedMaxima,
+    implied_values,
+    wrong_coefficient,
+)
 from bayesdist.missions.wise.meta_data.meta import WiseBand, monomial
 from bayesdist.model.basis import polynomial_terms
 from bayesdist.products.common.coefficients import (
@@ -46,7 +50,7 @@ def lint_wise_band(band: WiseBand) -> tuple[Finding, ...]:
         unusual count of digits, and comments that name a monomial other than that of the keyword.
     """
     # findings on CD would be about its nominal value, which is not in the file
-    findings = [f for f in lint_sip(band.sip) if f.where != "CD"]
+    findings = [f for f in lint_sip(band.sip, explain=wrong_coefficient) if f.where != "CD"]
     return (*findings, *_absent(band.sip), *_digits(band), *_comments(band), *_skew(band))
 
 

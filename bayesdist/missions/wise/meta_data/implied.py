@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -21,11 +21,19 @@ from bayesdist.formats.sip.header import (
     offset_ranges,
     repeated_names,
     with_coefficient,
+    worst_closure,
 )
 from bayesdist.model.basis import polynomial_terms
 from bayesdist.products.common.coefficients import evaluate, sip_keyword
+from bayesdist.products.common.document import Finding
 from bayesdist.utils.arrays import Bool, Float
 
+# A single coefficient is blamed if its correct value reduces the closure to this fraction.
+_EXPLAINED = 0.2
+# Smallest probability of further suspects that are named after the first one.
+_WORTH_NAMING = 0.05
+# Relative tolerance at which two numbers count as equal except for a mistyped sign.
+_SAME_SIZE = 0.05
 # Odds of a second, independent error, for inconsistencies that a suspect does not explain.
 _SECOND_FAULT = 1e-2
 # Rounding error of the components of a closure; pixels.
@@ -37,41 +45,6 @@ _MIDDLES = (np.arange(2000) + 0.5) / 2000
 # Points per axis at which stated maxima are compared, and the largest relative error of a maximum
 # that is found by such sampling.
 _NODES, _SAMPLED = 129, 2e-4
-
-
-@cache
-def _student_nodes(dof: int) -> Float:
-    """Equally probable nodes of Student's t distribution with unit scale, centred on zero."""
-    # imported here because few files need it and it slows down the import
-    from scipy.special import stdtrit
-
-    return np.asarray(stdtrit(dof, _MIDDLES), float)
-
-
-@dataclass(frozen=True)
-class _Student:
-    """Student's t distribution."""
-
-    dof: int
-    centre: float
-    scale: float
-
-    @property
-    def nodes(self) -> Float:
-        """Equally probable nodes of the distribution."""
-        return self.centre + self.scale * _student_nodes(self.dof)
-
-    def below(self, values: ArrayLike) -> Float:
-        """Cumulative probability at the given values."""
-        from scipy.special import stdtr
-
-        return np.asarray(stdtr(self.dof, (np.asarray(values) - self.centre) / self.scale), float)
-
-    def quantiles(self, probabilities: ArrayLike) -> Float:
-        """Values with the given cumulative probabilities."""
-        from scipy.special import stdtrit
-
-        return np.asarray(self.centre + self.scale * stdtrit(self.dof, probabilities), float)
 
 
 @dataclass(frozen=True)
@@ -182,6 +155,92 @@ def implied_values(sip: SipHeader, size: tuple[int, int] | None = None) -> tuple
         for (keyword, printed, nodes, sources), p in zip(coefficients, weights, strict=True)
     ]
     return tuple(sorted(implied, key=lambda value: -value.probability))
+
+
+def wrong_coefficient(sip: SipHeader, size: tuple[int, int], closure: float) -> Iterator[Finding]:
+    """Finding on a wrong coefficient whose correct value alone makes A, B and AP, BP agree.
+
+    The command `inspect` adds it to the checks of SIP headers (`bayesdist.plugin.Mission.checks`).
+
+    Parameters
+    ----------
+    sip : SipHeader
+        Header with an inverse.
+    size : tuple of int
+        Columns and rows of the detector.
+    closure : float
+        Largest distance between a pixel and the inverse of its forward position, pixels.
+
+    Yields
+    ------
+    Finding
+        Error that names the keyword and the implied value; nothing if no single coefficient
+        explains the closure.
+    """
+    suspects = implied_values(sip, size)
+    first = suspects[0]
+    remaining = worst_closure(with_coefficient(sip, first.keyword, first.value), size)
+    if remaining > _EXPLAINED * closure:
+        return
+    low, high = first.interval
+    message = (
+        f"is {first.printed:.7g}, and {' and '.join(first.sources)} imply {_with_error(first)} "
+        f"(95 %: {low:.7g} to {high:.7g}; closure then {remaining:.2g} px)"
+    )
+    if abs(first.printed + first.value) < _SAME_SIZE * abs(first.value):
+        message += "; the sign is wrong"
+    for names in repeated_names(sip):
+        if first.keyword in names:
+            repeated = " and ".join(n for n in names if n != first.keyword)
+            message += f"; what stands there is the value of {repeated}"
+    rivals = [suspect for suspect in suspects[1:] if suspect.probability > _WORTH_NAMING]
+    for rival in rivals:
+        message += f"; or {rival.keyword} should be {_with_error(rival)}"
+    if rivals:
+        message += "; these numbers alone do not tell which"
+    yield Finding("error", first.keyword, message)
+
+
+def _with_error(one: Implied) -> str:
+    """Text of value and standard deviation, with two digits of the latter."""
+    largest = max(abs(one.value), one.sigma)
+    digits = int(np.floor(np.log10(largest)) - np.floor(np.log10(one.sigma))) + 1
+    return f"{one.value:+.{min(digits, 15)}e} +- {one.sigma:.1e}"
+
+
+@cache
+def _student_nodes(dof: int) -> Float:
+    """Equally probable nodes of Student's t distribution with unit scale, centred on zero."""
+    # imported here because few files need it and it slows down the import
+    from scipy.special import stdtrit
+
+    return np.asarray(stdtrit(dof, _MIDDLES), float)
+
+
+@dataclass(frozen=True)
+class _Student:
+    """Student's t distribution."""
+
+    dof: int
+    centre: float
+    scale: float
+
+    @property
+    def nodes(self) -> Float:
+        """Equally probable nodes of the distribution."""
+        return self.centre + self.scale * _student_nodes(self.dof)
+
+    def below(self, values: ArrayLike) -> Float:
+        """Cumulative probability at the given values."""
+        from scipy.special import stdtr
+
+        return np.asarray(stdtr(self.dof, (np.asarray(values) - self.centre) / self.scale), float)
+
+    def quantiles(self, probabilities: ArrayLike) -> Float:
+        """Values with the given cumulative probabilities."""
+        from scipy.special import stdtrit
+
+        return np.asarray(self.centre + self.scale * stdtrit(self.dof, probabilities), float)
 
 
 def _cut(t: _Student, intervals: list[tuple[float, float]]) -> tuple[float, Float]:
@@ -349,10 +408,3 @@ def _crossing(
     from scipy.optimize import brentq
 
     return float(brentq(beyond, start, end, args=(limit,)))
-
-
-def with_error(one: Implied) -> str:
-    """Text of value and standard deviation, with two digits of the latter."""
-    largest = max(abs(one.value), one.sigma)
-    digits = int(np.floor(np.log10(largest)) - np.floor(np.log10(one.sigma))) + 1
-    return f"{one.value:+.{min(digits, 15)}e} +- {one.sigma:.1e}"
