@@ -2,7 +2,7 @@
 
 import pytest
 
-from bayesdist.formats.idctab.columns import idctab_column, idctab_powers
+from bayesdist.formats.idctab.table import idctab_column, idctab_powers
 from bayesdist.model import polynomial_terms
 
 

@@ -20,11 +20,9 @@ from bayesdist.calibration.chip_map import ChipMap, fitted_map
 from bayesdist.calibration.inverse import ExplicitInverse
 from bayesdist.calibration.plane import Plane
 from bayesdist.errors import FormatError
-from bayesdist.formats.idctab.columns import idctab_column
 from bayesdist.formats.idctab.drift import RATES
-from bayesdist.formats.idctab.hst import parity_of
-from bayesdist.formats.idctab.plausible import refuse_implausible
-from bayesdist.formats.idctab.table import FILTER_COLUMNS, IdcTab
+from bayesdist.formats.idctab.lint import refuse_implausible
+from bayesdist.formats.idctab.table import FILTER_COLUMNS, IdcTab, idctab_column, parity_of
 from bayesdist.utils.arrays import Float
 
 Filters = Sequence[str] | None

@@ -8,11 +8,8 @@ from pydantic import PositiveFloat
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.formats.idctab.build import idctab_from_solution
 from bayesdist.formats.idctab.calibration import idctab_calibration
-from bayesdist.formats.idctab.columns import idctab_column
-from bayesdist.formats.idctab.hst import parity_of
-from bayesdist.formats.idctab.lint import lint_idctab
-from bayesdist.formats.idctab.plausible import LIMITS
-from bayesdist.formats.idctab.table import FILTER_COLUMNS, HIGHEST, IdcTab
+from bayesdist.formats.idctab.lint import LIMITS, lint_idctab
+from bayesdist.formats.idctab.table import FILTER_COLUMNS, HIGHEST, IdcTab, idctab_column, parity_of
 from bayesdist.products.common.coefficients import largest_magnitude
 from bayesdist.products.common.content import Content
 from bayesdist.products.common.document import (

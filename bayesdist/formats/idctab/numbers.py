@@ -17,8 +17,8 @@ from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.chip_map import ChipMap
 from bayesdist.calibration.inverse import fitted_inverse
 from bayesdist.errors import InputError
-from bayesdist.formats.idctab.columns import idctab_column
 from bayesdist.formats.idctab.drift import RATES
+from bayesdist.formats.idctab.table import idctab_column
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.products.common.coefficients import propagated_sigma, require_regular
 from bayesdist.utils.arrays import Float

@@ -1,14 +1,24 @@
-"""Format of D2IMFILE and NPOLFILE."""
+"""Format of D2IMFILE and NPOLFILE, and their checks."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from itertools import combinations
+
 import numpy as np
 
+from bayesdist.errors import FormatError
 from bayesdist.formats.lookup.file import AXES, LookupFile, check_kind
-from bayesdist.formats.lookup.lint import lint_lookup_file
 from bayesdist.model import LookupTable
 from bayesdist.products.common.content import Content
-from bayesdist.products.common.document import Format, finding_lines, identity_lines
+from bayesdist.products.common.document import (
+    Finding,
+    Format,
+    finding_lines,
+    identity_lines,
+    missing_identity,
+)
+from bayesdist.products.common.lookup_plane import Plane
 
 
 def _parse(content: Content) -> LookupFile | None:
@@ -61,6 +71,188 @@ def _tables(file: LookupFile) -> tuple[LookupTable, ...]:
     """Look-up tables of the detector."""
     check_kind(file, "d2im")
     return tuple(file.table(chip) for chip in file.chips)
+
+
+# -- checks ---------------------------------------------------------------------------------------
+
+
+_PLACE = ("CRPIX1", "CRPIX2", "CRVAL1", "CRVAL2")
+
+
+def lint_lookup_file(file: LookupFile) -> tuple[Finding, ...]:
+    """Check a D2IMFILE or NPOLFILE against the behaviour of stwcs and astropy.wcs.
+
+    Parameters
+    ----------
+    file : LookupFile
+        File to check.
+
+    Returns
+    -------
+    tuple of Finding
+        Errors, warnings and notes.
+
+    Raises
+    ------
+    FormatError
+        If a keyword that must be numeric is not.
+    """
+    return (
+        *_header(file),
+        *_registration(file),
+        *_chips(file),
+        *_values(file),
+        *_sigma(file),
+    )
+
+
+def _is_wfc(file: LookupFile) -> bool:
+    return (file.instrument, file.detector) == ("ACS", "WFC")
+
+
+def _header(file: LookupFile) -> Iterator[Finding]:
+    for keyword in ("INSTRUME", "DETECTOR"):
+        if keyword not in file.header:
+            yield Finding("error", keyword, "is missing, and stwcs stops without it")
+    yield from missing_identity(file.header)
+    if file.kind == "npol" and not file.filters:
+        yield Finding(
+            "warning", "FILTER1", "is missing: the file does not say what filter it is of"
+        )
+    if file.kind == "d2im" and file.filters:
+        yield Finding("warning", "FILTER1", "a D2IMFILE is applied whatever the filter")
+
+
+def _registration(file: LookupFile) -> Iterator[Finding]:
+    """Findings on node positions, one per group of extensions with the same missing keywords."""
+    groups: dict[tuple[str, ...], list[Plane]] = {}
+    for plane in file.planes:
+        groups.setdefault(plane.missing, []).append(plane)
+    for missing, planes in groups.items():
+        location = _names(planes)
+        steps = [name for name in missing if name.startswith("CDELT")]
+        if steps:
+            yield Finding(
+                "error",
+                location,
+                f"{', '.join(steps)} missing: nodes are taken to be 1 pixel apart",
+            )
+        elif set(missing) == set(_PLACE):
+            (x, y), (dx, dy) = planes[0].first, planes[0].step
+            yield Finding(
+                "warning",
+                location,
+                f"registration: without CRPIX and CRVAL astropy.wcs puts the first node at pixel "
+                f"({x:g}, {y:g}), before its version 6.1 at (1, 1); centres of bins would be at "
+                f"({dx / 2 + 0.5:g}, {dy / 2 + 0.5:g})",
+            )
+        elif missing:
+            yield Finding(
+                "warning", location, f"registration: {', '.join(missing)} missing, taken 0"
+            )
+    for plane in file.planes:
+        yield from _cover(plane)
+
+
+def _cover(plane: Plane) -> Iterator[Finding]:
+    """Findings on tables that end more than a step inside an edge and are constant beyond."""
+    sizes = [plane.number(f"ONAXIS{a}", 0) for a in (1, 2)]
+    for axis, (n, first, step, size) in enumerate(
+        zip(plane.nodes.shape[::-1], plane.first, plane.step, sizes, strict=True)
+    ):
+        last = first + (n - 1) * step
+        if size and step > 0 and (first - 1 > step or size - last > step):
+            yield Finding(
+                "warning",
+                _names([plane]),
+                f"the nodes span pixels {first:g} to {last:g} of {'xy'[axis]}, the chip 1 to "
+                f"{size:g}: beyond them the table is constant",
+            )
+
+
+def _chips(file: LookupFile) -> Iterator[Finding]:
+    without = [p for p in file.planes if "CCDCHIP" not in p.header]
+    if without:
+        consequence = "stwcs stops without it" if _is_wfc(file) else "stwcs takes chip 1"
+        yield Finding(
+            "error" if _is_wfc(file) else "note", _names(without), f"no CCDCHIP: {consequence}"
+        )
+    elif _is_wfc(file):
+        swapped = [p for p in file.planes if p.version != 3 - p.chip and p.chip in (1, 2)]
+        if swapped:
+            yield Finding(
+                "warning",
+                _names(swapped),
+                "EXTVER 1 is chip 2 of ACS/WFC and EXTVER 2 chip 1, but CCDCHIP, by which stwcs "
+                "goes, says the opposite: the chips may be swapped",
+            )
+        for chip in {1, 2} - set(file.chips):
+            yield _absent(file, chip, "DX, DY")
+    for chip in file.chips:
+        names = [p.name for p in file.planes if p.chip == chip]
+        for axis in AXES:
+            if axis not in names:
+                yield _absent(file, chip, axis)
+            elif names.count(axis) > 1:
+                yield Finding(
+                    "warning",
+                    f"chip {chip}",
+                    f"{names.count(axis)} extensions {axis}: stwcs takes the values of the last "
+                    "and the registration of the first",
+                )
+        if sorted(names) == sorted(AXES):
+            try:
+                file.pair(chip)
+            except FormatError as error:
+                yield Finding("error", f"chip {chip}", error.cause)
+
+
+def _absent(file: LookupFile, chip: int, axes: str) -> Finding:
+    if file.kind == "npol":
+        return Finding("error", f"chip {chip}", f"no {axes}, and stwcs stops at that chip")
+    return Finding("warning", f"chip {chip}", f"no {axes}: stwcs leaves it as it is")
+
+
+def _values(file: LookupFile) -> Iterator[Finding]:
+    good = []
+    for plane in file.planes:
+        values = plane.values
+        if min(values.shape) < 2:
+            yield Finding("error", _names([plane]), f"shape {values.shape} is no grid of nodes")
+        elif not np.isfinite(values).all():
+            count = int((~np.isfinite(values)).sum())
+            yield Finding(
+                "error", _names([plane]), f"{count} nodes are not finite: so is the sky around them"
+            )
+        else:
+            good.append(plane)
+    for plane in good:
+        if plane.values.max() < 0:
+            keyword = "CPERR" if file.kind == "npol" else "D2IMERR"
+            yield Finding(
+                "error",
+                _names([plane]),
+                f"all nodes are negative: stwcs writes their maximum, {plane.values.max():.4g}, as "
+                f"{keyword}, and astropy.wcs leaves out a table whose {keyword} is below zero",
+            )
+    for a, b in combinations(good, 2):
+        if a.nodes.shape == b.nodes.shape and a.nodes.any() and (a.nodes == b.nodes).all():
+            yield Finding("warning", _names([a, b]), "the same values: one may be a copy")
+
+
+def _sigma(file: LookupFile) -> Iterator[Finding]:
+    shapes = {(p.chip, p.name): p.nodes.shape for p in file.planes}
+    for plane in file.sigma_planes:
+        values = plane.values
+        if not (np.isfinite(values).all() and (values >= 0).all()):
+            yield Finding("warning", _names([plane]), "some sigmas are negative or not finite")
+        if shapes.get((plane.chip, plane.name.removeprefix("SIGMA_"))) != values.shape:
+            yield Finding("warning", _names([plane]), "the shape is not that of the table")
+
+
+def _names(planes: list[Plane]) -> str:
+    """Names of extensions, such as "DX,1"."""
+    return ", ".join(f"{p.name},{p.version}" for p in planes)
 
 
 FORMAT = Format(

@@ -16,9 +16,8 @@ from bayesdist.calibration.plane import Orientation
 from bayesdist.errors import InputError
 from bayesdist.formats.idctab.build import idctab_from_solution
 from bayesdist.formats.idctab.drift import storable
-from bayesdist.formats.idctab.hst import combination_of
 from bayesdist.formats.idctab.lint import lint_idctab
-from bayesdist.formats.idctab.table import read_idctab
+from bayesdist.formats.idctab.table import combination_of, read_idctab
 from bayesdist.infer.solution.transforms import reference_gauge
 from bayesdist.missions.hst.release import Period, Release, write_release
 from bayesdist.missions.hst.simulate import acs_solution
