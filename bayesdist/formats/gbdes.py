@@ -29,6 +29,7 @@ from bayesdist.products.common.document import (
     MissingSizeError,
     finding_lines,
 )
+from bayesdist.products.common.rules import WIDEST_IMAGE, is_skewed, mixed_parities, not_finite
 from bayesdist.utils.arrays import Float, Int
 
 if TYPE_CHECKING:
@@ -113,7 +114,7 @@ def _lint(found: GbdesParameters) -> tuple[Finding, ...]:
 
 def _findings(found: GbdesParameters) -> Iterator[Finding]:
     table = found.table
-    handed: set[float] = set()  # signs of the determinants
+    determinants = []
     for name, rows in found.maps.items():
         axes = [str(v) for v in np.asarray(table["coordinate"])[rows]]
         half = len(rows) // 2
@@ -122,22 +123,20 @@ def _findings(found: GbdesParameters) -> Iterator[Finding]:
             yield Finding(
                 "error", name, "coefficients are not in the order x, y, each from 0 upwards"
             )
-        if not np.isfinite(np.asarray(table["parameter"], float)[rows]).all():
-            yield Finding("error", name, "holds parameters that are not finite")
         slope = np.asarray(table["parameter"], float)[rows]
+        yield from not_finite(slope, name, "holds parameters that are not finite")
         if half >= 3 and _DEVICE.match(name):
             linear = np.array([slope[1:3], slope[half + 1 : half + 3]])
-            handed.add(float(np.sign(np.linalg.det(linear))))
-            across, up = np.hypot(*linear)
-            unequal = min(across, up) < 0.5 * max(across, up)
-            if unequal or abs(np.linalg.det(linear)) < 0.5 * across * up:
+            determinants.append(float(np.linalg.det(linear)))
+            if is_skewed(linear):
                 yield Finding(
                     "error", name, "its axes are not perpendicular: x and y may be exchanged"
                 )
-            if max(across, up) > 90:
+            if np.hypot(*linear).max() > WIDEST_IMAGE / 2:
                 yield Finding("error", name, "is wider than the sky: its unit is the degree")
-    if len(handed) > 1:
-        yield Finding("warning", "parameter", "detectors are of different parity: check their maps")
+    yield from mixed_parities(
+        determinants, "parameter", "detectors are of different parity: check their maps"
+    )
     cov = found.covariance
     if cov is None:
         yield Finding("warning", "MAP_x_n_cov", "columns of the covariance are missing")

@@ -31,6 +31,7 @@ from bayesdist.products.common.document import (
     required_size,
 )
 from bayesdist.products.common.parameters import parameters_content, with_parameters
+from bayesdist.products.common.rules import is_skewed, no_side_file, too_wide
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.text import ascii_of, number_of
 
@@ -151,9 +152,6 @@ def _poly_lines(rows: list[tuple[float, int, int, int]], settings: Settings) -> 
     ]
 
 
-_SKEW = 0.5  # smallest plausible sine of the angle between the axes, and ratio of their scales
-
-
 # -- checks ---------------------------------------------------------------------------------------
 
 
@@ -162,9 +160,7 @@ def lint_ast(file: AstFile) -> tuple[Finding, ...]:
     out = [f for step in file.steps for f in _inverse(step.kind, step.poly)]
     out += list(_shape(file))
     if file.side_file and file.content.path and file.content.beside(file.side_file) is None:
-        out.append(
-            Finding("warning", "parameters", f"{file.side_file}, the covariance, is not here")
-        )
+        out.append(no_side_file("parameters", file.side_file))
     return tuple(out)
 
 
@@ -193,9 +189,7 @@ def _shape(file: AstFile) -> Iterator[Finding]:
     slope = np.array([[u[0] - u[1], u[2] - u[3]], [v[0] - v[1], v[2] - v[3]]])
     across, up = np.hypot(*slope)
     det = float(np.linalg.det(slope))
-    if min(across, up) == 0 or abs(det) < _SKEW * across * up or (
-        min(across, up) < _SKEW * max(across, up)
-    ):  # fmt: skip
+    if is_skewed(slope):
         yield Finding(
             "error", "PF", f"the axes are {across:.3g} and {up:.3g} a pixel and not perpendicular: "
             "the powers of the inputs may be exchanged in one output",
@@ -203,9 +197,9 @@ def _shape(file: AstFile) -> Iterator[Finding]:
     elif det > 0 and file.remarks.get("plane") == "sky":
         yield Finding("note", "CF", "has the parity of a mirror image of the sky")
     width = max(across, up) * max(nx, ny)
-    if file.size is not None and width > 180:
-        yield Finding(
-            "error", "CF", f"makes the detector {width:.3g} degrees wide: outputs are in degrees"
+    if file.size is not None:
+        yield from too_wide(
+            width, "CF", "makes the detector {width:.3g} degrees wide: outputs are in degrees"
         )
 
 

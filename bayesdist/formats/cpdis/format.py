@@ -43,10 +43,19 @@ from bayesdist.products.common.document import (
     Format,
     FormatSettings,
     MissingSizeError,
-    of_part,
 )
 from bayesdist.products.common.lookup_plane import Plane
 from bayesdist.products.common.parameters import parameters_hdu
+from bayesdist.products.common.rules import (
+    NO_SIZE,
+    LinearPart,
+    Missing,
+    missing,
+    no_grid,
+    not_finite,
+    of_part,
+    too_wide,
+)
 from bayesdist.products.common.wcs_text import describe_wcs
 from bayesdist.utils.arrays import Float
 
@@ -208,7 +217,7 @@ _TINY = 1e-3  # pixels; if all shifts are smaller, the table is probably in anot
 _ASKEW = 0.75  # steps; half the difference between the margins at both ends that is reported
 # expected sign of det(CD) by CTYPE1: RA increases to the left, solar longitude to the right
 _HANDED = {"RA--": -1, "HPLN": 1}
-_WIDE = 180.0  # degrees; an image this wide means that CD is in arcseconds
+_LINEAR = LinearPart("CD", "has the parity of a mirror image")
 
 
 def lint_cpdis(file: CpdisFile) -> tuple[Finding, ...]:
@@ -222,7 +231,7 @@ def lint_cpdis(file: CpdisFile) -> tuple[Finding, ...]:
         try:
             cpdis_calibration(file, file.name, Choice())
         except MissingSizeError:
-            out.append(Finding("note", "NAXIS1", "the size of the image is not stated"))
+            out.append(NO_SIZE)
         except FormatError as error:
             out.append(Finding("error", "BDPARAM", error.cause))
     return tuple(out)
@@ -232,22 +241,18 @@ def _records(image: CpdisImage) -> Iterator[Finding]:
     for axis in (1, 2):
         function = image.function(axis)
         if not function:
-            yield Finding("warning", f"CPDIS{axis}", "is missing: that axis has no distortion")
+            yield Missing(f"CPDIS{axis}", ": that axis has no distortion", "warning").finding
             continue
         if function != "LOOKUP":
             yield Finding(
                 "error", f"CPDIS{axis}", f"is {function}: astropy.wcs leaves it out with a warning"
             )
             continue
-        if f"DP{axis}.EXTVER" not in image.header:
-            yield Finding(
-                "warning",
-                f"DP{axis}.EXTVER",
-                "is missing, and taken for 1: both axes share a table",
-            )
+        shared = ", and taken for 1: both axes share a table"
+        yield from missing(image.header, [Missing(f"DP{axis}.EXTVER", shared, "warning")])
         axes = image.axes(axis)
         if None in axes:
-            yield Finding("error", f"DP{axis}.AXIS", "is missing, and astropy.wcs stops without it")
+            yield Missing(f"DP{axis}.AXIS", ", and astropy.wcs stops without it").finding
         elif axes != (1, 2):
             yield Finding(
                 "error", f"DP{axis}.AXIS",
@@ -273,11 +278,11 @@ def _tables(image: CpdisImage) -> Iterator[Finding]:
     for axis, plane in planes.items():
         location = f"{TABLES},{image.version(axis)}"
         values = plane.values
-        if values.ndim != 2 or min(values.shape) < 2:
-            yield Finding("error", location, f"shape {values.shape} is no grid of nodes")
-            return
-        if not np.isfinite(values).all():
-            yield Finding("error", location, "holds nodes that are not finite")
+        unusable = no_grid(values, location) or not_finite(
+            values, location, "holds nodes that are not finite"
+        )
+        if unusable:
+            yield from unusable
             return
         largest.append(float(np.abs(values).max()))
         if plane.missing:
@@ -322,8 +327,9 @@ def _registration(image: CpdisImage, plane: Plane, where: str) -> Iterator[Findi
 
 def _linear(image: CpdisImage) -> Iterator[Finding]:
     det = float(np.linalg.det(image.cd))
+    width = np.sqrt(abs(det)) * max(image.size or (0,))
     if det == 0:
-        yield Finding("error", "CD", "is singular")
+        yield from _LINEAR.findings(det)
     elif "-" not in str(image.header.get("CTYPE1", "")):  # as in RA---TAN
         yield Finding(
             "note",
@@ -331,10 +337,12 @@ def _linear(image: CpdisImage) -> Iterator[Finding]:
             "names no position on the sky: u, v are on a plane of unknown position, and CD is in "
             "degrees unless CUNIT says otherwise",
         )
-    elif image.size is not None and np.sqrt(abs(det)) * max(image.size) > _WIDE:
-        yield Finding("error", "CD", "makes the image wider than the sky: check its unit")
-    elif det * _HANDED.get(str(image.header.get("CTYPE1", ""))[:4], 0) < 0:
-        yield Finding("note", "CD", "has the parity of a mirror image")
+    elif wide := too_wide(width, "CD", "makes the image wider than the sky: check its unit"):
+        yield from wide
+    else:
+        yield from _LINEAR.findings(
+            det, mirror=-_HANDED.get(str(image.header.get("CTYPE1", ""))[:4], 0)
+        )
 
 
 def _alternates(image: CpdisImage) -> Iterator[Finding]:

@@ -15,7 +15,15 @@ from bayesdist.formats.idctab.table import (
     idctab_powers,
     parity_of,
 )
-from bayesdist.products.common.document import Finding, missing_identity, repeated_values
+from bayesdist.products.common.document import Finding
+from bayesdist.products.common.rules import (
+    IDENTITY,
+    Missing,
+    above_order,
+    missing,
+    not_finite,
+    repeated_values,
+)
 
 _SCALE_RATIO = 1.25
 
@@ -49,18 +57,19 @@ def _not_finite(tab: IdcTab) -> list[Finding]:
             continue
         for name in rows.dtype.names or ():
             column = rows[name]
-            if column.dtype.kind == "f" and not np.isfinite(column).all():
+            if column.dtype.kind == "f":
                 bad = np.unique(np.nonzero(~np.isfinite(column))[0])
                 location = f"{rows_text(bad)}{of}, column {name}"
-                out.append(Finding("error", location, "not a finite number"))
+                out += not_finite(column, location, "not a finite number")
     return out
 
 
 def _header(tab: IdcTab) -> Iterator[Finding]:
     header = tab.header
-    yield from missing_identity(header)
+    yield from missing(header, IDENTITY)
     if not tab.detector:
-        yield Finding("warning", "DETECTOR", "is missing: stwcs then reads no time-dependent terms")
+        without = ": stwcs then reads no time-dependent terms"
+        yield Missing("DETECTOR", without, "warning").finding
     elif tab.tdd and not tab.is_acs_wfc:
         yield Finding(
             "warning",
@@ -89,14 +98,16 @@ def _time(tab: IdcTab) -> Iterator[Finding]:
             "there are no time-dependent terms, so stwcs applies its own of 2004.5, wrong by 30 to "
             "50 mas in 2016 (no drift is written as TDD_CTB1 = TDD_CTB2 = 0)",
         )
-    elif "TDD_DATE" not in tab.tdd:
-        yield Finding("error", "TDD_DATE", "is missing, and stwcs stops without it")
+    else:
+        yield from missing(tab.tdd, [Missing("TDD_DATE", ", and stwcs stops without it")])
     if scheme == "2015":
-        for chip in tab.stated_chips or (1,):
-            if f"TDD_CTB{chip}" not in tab.tdd:
-                yield Finding(
-                    "error", f"TDD_CTB{chip}", "is missing, and stwcs stops at that chip without it"
-                )
+        yield from missing(
+            tab.tdd,
+            [
+                Missing(f"TDD_CTB{chip}", ", and stwcs stops at that chip without it")
+                for chip in tab.stated_chips or (1,)
+            ],
+        )
         alphas = [k for k, v in tab.tdd.items() if k[:7] in ("TDD_CTA", "TDD_CXA", "TDD_CYA") and v]
         if alphas:
             yield Finding("warning", ", ".join(alphas), "stwcs reads but never applies it")
@@ -129,9 +140,8 @@ def _table(tab: IdcTab) -> Iterator[Finding]:
     powers = {c: p for c in columns if (p := idctab_powers(c)) and p[0] in tab.prefixes}
     above = [c for c, (_, i, j) in powers.items() if i + j > tab.norder]
     if above:
-        yield Finding(
-            "note", f"{above[0]} .. {above[-1]}", f"above NORDER {tab.norder}, so ignored"
-        )
+        shown = f"{above[0]} .. {above[-1]}"
+        yield from above_order(above, shown, f"NORDER {tab.norder}", "note")
     single = [c for c in columns if rows[c].dtype == np.float32]
     if single:
         yield Finding(

@@ -16,9 +16,16 @@ from bayesdist.products.common.document import (
     Format,
     finding_lines,
     identity_lines,
-    missing_identity,
 )
 from bayesdist.products.common.lookup_plane import Plane
+from bayesdist.products.common.rules import (
+    IDENTITY,
+    Missing,
+    missing,
+    no_grid,
+    no_sigmas,
+    not_finite,
+)
 
 
 def _parse(content: Content) -> LookupFile | None:
@@ -77,6 +84,10 @@ def _tables(file: LookupFile) -> tuple[LookupTable, ...]:
 
 
 _PLACE = ("CRPIX1", "CRPIX2", "CRVAL1", "CRVAL2")
+_KEYWORDS = (
+    *(Missing(keyword, ", and stwcs stops without it") for keyword in ("INSTRUME", "DETECTOR")),
+    *IDENTITY,
+)
 
 
 def lint_lookup_file(file: LookupFile) -> tuple[Finding, ...]:
@@ -111,14 +122,10 @@ def _is_wfc(file: LookupFile) -> bool:
 
 
 def _header(file: LookupFile) -> Iterator[Finding]:
-    for keyword in ("INSTRUME", "DETECTOR"):
-        if keyword not in file.header:
-            yield Finding("error", keyword, "is missing, and stwcs stops without it")
-    yield from missing_identity(file.header)
+    yield from missing(file.header, _KEYWORDS)
     if file.kind == "npol" and not file.filters:
-        yield Finding(
-            "warning", "FILTER1", "is missing: the file does not say what filter it is of"
-        )
+        unknown = ": the file does not say what filter it is of"
+        yield Missing("FILTER1", unknown, "warning").finding
     if file.kind == "d2im" and file.filters:
         yield Finding("warning", "FILTER1", "a D2IMFILE is applied whatever the filter")
 
@@ -128,16 +135,16 @@ def _registration(file: LookupFile) -> Iterator[Finding]:
     groups: dict[tuple[str, ...], list[Plane]] = {}
     for plane in file.planes:
         groups.setdefault(plane.missing, []).append(plane)
-    for missing, planes in groups.items():
+    for absent, planes in groups.items():
         location = _names(planes)
-        steps = [name for name in missing if name.startswith("CDELT")]
+        steps = [name for name in absent if name.startswith("CDELT")]
         if steps:
             yield Finding(
                 "error",
                 location,
                 f"{', '.join(steps)} missing: nodes are taken to be 1 pixel apart",
             )
-        elif set(missing) == set(_PLACE):
+        elif set(absent) == set(_PLACE):
             (x, y), (dx, dy) = planes[0].first, planes[0].step
             yield Finding(
                 "warning",
@@ -146,9 +153,9 @@ def _registration(file: LookupFile) -> Iterator[Finding]:
                 f"({x:g}, {y:g}), before its version 6.1 at (1, 1); centres of bins would be at "
                 f"({dx / 2 + 0.5:g}, {dy / 2 + 0.5:g})",
             )
-        elif missing:
+        elif absent:
             yield Finding(
-                "warning", location, f"registration: {', '.join(missing)} missing, taken 0"
+                "warning", location, f"registration: {', '.join(absent)} missing, taken 0"
             )
     for plane in file.planes:
         yield from _cover(plane)
@@ -217,14 +224,11 @@ def _values(file: LookupFile) -> Iterator[Finding]:
     good = []
     for plane in file.planes:
         values = plane.values
-        if min(values.shape) < 2:
-            yield Finding("error", _names([plane]), f"shape {values.shape} is no grid of nodes")
-        elif not np.isfinite(values).all():
-            count = int((~np.isfinite(values)).sum())
-            yield Finding(
-                "error", _names([plane]), f"{count} nodes are not finite: so is the sky around them"
-            )
-        else:
+        unusable = no_grid(values, _names([plane])) or not_finite(
+            values, _names([plane]), "{count} nodes are not finite: so is the sky around them"
+        )
+        yield from unusable
+        if not unusable:
             good.append(plane)
     for plane in good:
         if plane.values.max() < 0:
@@ -243,11 +247,13 @@ def _values(file: LookupFile) -> Iterator[Finding]:
 def _sigma(file: LookupFile) -> Iterator[Finding]:
     shapes = {(p.chip, p.name): p.nodes.shape for p in file.planes}
     for plane in file.sigma_planes:
-        values = plane.values
-        if not (np.isfinite(values).all() and (values >= 0).all()):
-            yield Finding("warning", _names([plane]), "some sigmas are negative or not finite")
-        if shapes.get((plane.chip, plane.name.removeprefix("SIGMA_"))) != values.shape:
-            yield Finding("warning", _names([plane]), "the shape is not that of the table")
+        yield from no_sigmas(
+            plane.values,
+            shapes.get((plane.chip, plane.name.removeprefix("SIGMA_"))),
+            _names([plane]),
+            "some sigmas are negative or not finite",
+            "the shape is not that of the table",
+        )
 
 
 def _names(planes: list[Plane]) -> str:

@@ -14,7 +14,7 @@ from pydantic import Field
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.chip_map import ChipMap, Monomials
 from bayesdist.calibration.inverse import fit_inverse
-from bayesdist.errors import BayesdistError, InputError, required
+from bayesdist.errors import InputError, required
 from bayesdist.formats.siaf.table import (
     AGREEMENT,
     COLUMNS,
@@ -51,6 +51,7 @@ from bayesdist.products.common.record import (
     error_lines,
     record_of,
 )
+from bayesdist.products.common.rules import Inverse, LinearPart, no_side_file, record
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.text import ascii_of
 
@@ -237,8 +238,20 @@ def _read_back(files: Sequence[Built], *_: Any) -> list[ReadBack]:
 # -- checks ---------------------------------------------------------------------------------------
 
 
-# Pixels: closure of a good inverse, and a closure that only a wrong coefficient explains.
-_CLOSURE_GOOD, _CLOSURE_BAD = 0.05, 1.0
+_LINEAR = LinearPart(
+    "Sci2IdlX, Sci2IdlY",
+    "parity: Ideal coordinates are mirrored against x, y, which no aperture has but those of OSS "
+    "(that of V2, V3 is VIdlParity)",
+    level="error",
+    singular="the linear part is singular",
+)
+_INVERSE = Inverse(
+    "Idl2SciX, Idl2SciY",
+    good=0.05,
+    bad=1.0,
+    misses="they miss the inverse of Sci2Idl",
+    poor="the inverse is wrong by up to {closure:.3g} px; raise the order",
+)
 # Pixels of imagers are 0.03 to 0.2 arcsec wide; much smaller ones are in degrees or radians.
 _SMALLEST_PIXEL = 5e-3
 
@@ -276,14 +289,7 @@ def _linear(table: SiafTable) -> Iterator[Finding]:
     x, y = (table.terms(name) for name in ("Sci2IdlX", "Sci2IdlY"))
     linear = np.array([[t.get((1, 0), 0.0), t.get((0, 1), 0.0)] for t in (x, y)])
     area = float(np.linalg.det(linear))
-    if area == 0:
-        yield Finding("error", "Sci2IdlX, Sci2IdlY", "the linear part is singular")
-    elif area < 0 and not table.aperture.endswith("_OSS"):
-        yield Finding(
-            "error", "Sci2IdlX, Sci2IdlY",
-            "parity: Ideal coordinates are mirrored against x, y, which no aperture has but those "
-            "of OSS (that of V2, V3 is VIdlParity)",
-        )  # fmt: skip
+    yield from _LINEAR.findings(area, mirror=0 if table.aperture.endswith("_OSS") else -1)
     pixel = float(np.sqrt(abs(area)))
     if 0 < pixel < _SMALLEST_PIXEL:
         yield Finding(
@@ -301,47 +307,37 @@ def _linear(table: SiafTable) -> Iterator[Finding]:
 
 def _inverse_checks(table: SiafTable) -> Iterator[Finding]:
     closure = table.closure()
-    location = "Idl2SciX, Idl2SciY"
+    location = _INVERSE.where
     if table.inverse is None and table.size is not None:
         yield Finding("error", location, "the inverse is missing: all its coefficients are zero")
         return
     if closure is None:
         yield Finding("note", location, "the size of the detector is not known: it is not checked")
         return
-    if closure <= _CLOSURE_GOOD:
-        return
-    closures = {
-        blamed: replace(table, rows=tuple(_exchanged(table, columns))).closure() or 0.0
-        for columns, blamed in (((2, 3), location), ((0, 1), "Sci2IdlX, Sci2IdlY"))
-    }
-    # if powers are exchanged in both they nearly agree again, so the better one is right
-    best = min(closures, key=lambda blamed: closures[blamed])
-    if closures[best] < closure / 10:
-        yield Finding(
-            "error", best, "the order of coefficients: powers of x and y are exchanged "
-            f"(closure {closure:.3g} px)",
-        )  # fmt: skip
-        return
+    yield from _INVERSE.findings(
+        closure,
+        (
+            (part, replace(table, rows=tuple(_exchanged(table, columns))).closure() or 0.0)
+            for columns, part in (((2, 3), location), ((0, 1), "Sci2IdlX, Sci2IdlY"))
+        ),
+        lambda: _shift(table, closure),
+        conclusive=True,
+    )
+
+
+def _shift(table: SiafTable, closure: float) -> Iterator[Finding]:
+    """Finding on constant terms that explain the closure."""
     residual = table.closure_residuals()
-    if residual is not None:
-        shift = residual.mean(axis=1)
-        without = float(np.hypot(*(residual - shift[:, None])).max())
-        if without < closure / 10:
-            yield Finding(
-                "error", location,
-                f"the constant terms are off by {shift[0]:.4g} and {shift[1]:.4g} "
-                f"px (closure {closure:.3g} px, without this shift {without:.2g} px)",
-            )  # fmt: skip
-            return
-    if closure > _CLOSURE_BAD:
+    if residual is None:
+        return
+    shift = residual.mean(axis=1)
+    without = float(np.hypot(*(residual - shift[:, None])).max())
+    if without < closure / 10:
         yield Finding(
-            "error", location, f"they miss the inverse of Sci2Idl by up to {closure:.3g} px: a "
-            "coefficient of one or the other is wrong",
+            "error", _INVERSE.where,
+            f"the constant terms are off by {shift[0]:.4g} and {shift[1]:.4g} "
+            f"px (closure {closure:.3g} px, without this shift {without:.2g} px)",
         )  # fmt: skip
-    else:
-        yield Finding(
-            "warning", location, f"the inverse is wrong by up to {closure:.3g} px; raise the order"
-        )
 
 
 def _exchanged(table: SiafTable, columns: tuple[int, int]) -> Iterator[Row]:
@@ -359,20 +355,17 @@ def _exchanged(table: SiafTable, columns: tuple[int, int]) -> Iterator[Row]:
 def _record(table: SiafTable) -> Iterator[Finding]:
     if table.record is None:
         if table.names_side_file:
-            missing = f"{side_name(table.name)}, the covariance, is not here"
-            yield Finding("warning", "covariance", missing)
+            yield no_side_file("covariance", side_name(table.name))
         else:
             yield Finding("note", "covariance", "there is no side file: no uncertainty is stated")
         return
-    try:
-        far = departure(table, calibration_from(table.record, table.name))
-    except BayesdistError as error:
-        yield Finding("error", "covariance", error.cause)
-        return
-    if not far <= AGREEMENT:
-        yield Finding(
-            "error", "covariance", f"the side file is of another table, by up to {far:.3g} px"
-        )
+    stored = table.record
+    yield from record(
+        "covariance",
+        lambda: departure(table, calibration_from(stored, table.name)),
+        AGREEMENT,
+        "the side file is of another table, by up to {far:.3g} px",
+    )
 
 
 FORMAT = Format(

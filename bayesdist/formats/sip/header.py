@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 from bayesdist.calibration.inverse import detector_grid
 from bayesdist.errors import InputError
 from bayesdist.products.common.coefficients import evaluate, radial_orders, sip_keyword
-from bayesdist.products.common.document import repeated_values
+from bayesdist.products.common.rules import repeated_values
 from bayesdist.utils.arrays import Float
 
 Terms = Mapping[tuple[int, int], float]

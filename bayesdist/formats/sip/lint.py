@@ -24,15 +24,27 @@ from bayesdist.formats.sip.header import (
 )
 from bayesdist.products.common.coefficients import largest_magnitude, sip_keyword
 from bayesdist.products.common.document import Finding
+from bayesdist.products.common.rules import Inverse, LinearPart, above_order, copies, stated_closure
 
-# Pixels: closure of a good inverse, and a closure that only a wrong coefficient explains.
-_CLOSURE_GOOD, _CLOSURE_BAD = 0.01, 0.5
 # Tolerance between a stated value and the computed one: headers print three decimals.
 _DMAX_ABSOLUTE, _DMAX_RELATIVE = 1e-3, 1e-3
-_CLOSURE_RELATIVE = 1e-2
 # No program computes with A_DMAX, so a rough value does no harm; a wrong one suggests that it
 # belongs to another header.
 _DMAX_ROUGH = 0.1
+
+_LINEAR = LinearPart(
+    "CD",
+    "parity: the determinant is positive, so the image is a mirror image of the sky",
+    singular="the matrix is singular: no pixel has a position on the sky",
+)
+_INVERSE = Inverse(
+    "AP, BP",
+    good=0.01,
+    bad=0.5,
+    misses="they miss the inverse of A, B",
+    poor="the inverse is wrong by up to {closure:.3g} px; ",
+    exchanged="index order: p and q are exchanged against A and B",
+)
 
 # ``explain(sip, size, closure)`` yields findings on the coefficient that explains a closure; pixels
 Explanation = Callable[[SipHeader, tuple[int, int], float], Iterable[Finding]]
@@ -66,7 +78,7 @@ def lint_sip(
         *_frame(sip),
         *_orders(sip),
         *_low_terms(sip, size),
-        *_repeated(sip),
+        *copies(values_by_keyword(sip), groups=repeated_names(sip)),
         *_sigmas(sip),
     ]
     if size is None:
@@ -96,20 +108,14 @@ def _frame(sip: SipHeader) -> Iterator[Finding]:
         yield Finding("error", "CRVAL1, CRVAL2", f"({ra:g}, {dec:g}) degrees lie on no sphere")
     if not np.abs(sip.crpix).max() <= FAR:
         yield Finding("error", "CRPIX1, CRPIX2", f"{sip.crpix[0]:g}, {sip.crpix[1]:g} is no pixel")
-    if np.linalg.det(sip.cd) == 0:
-        yield Finding("error", "CD", "the matrix is singular: no pixel has a position on the sky")
-    elif sip.linear_axes:
+    determinant = float(np.linalg.det(sip.cd))
+    yield from _LINEAR.findings(determinant, mirror=0 if sip.linear_axes else 1)
+    if sip.linear_axes and determinant != 0:
         yield Finding(
             "note", "CTYPE", "positions are u, v on a plane of their own, and not the sky; astropy "
             "applies A and B, and remarks that CTYPE does not end in -SIP",
         )  # fmt: skip
         return
-    elif np.linalg.det(sip.cd) > 0:
-        yield Finding(
-            "note",
-            "CD",
-            "parity: the determinant is positive, so the image is a mirror image of the sky",
-        )
     if not all(c.endswith("-SIP") for c in sip.ctype):
         yield Finding(
             "warning", "CTYPE", f"{' and '.join(map(repr, sip.ctype))} do not end in -SIP: "
@@ -130,8 +136,7 @@ def _orders(sip: SipHeader) -> Iterator[Finding]:
         if order > high:
             yield Finding("error", keyword, f"is {order}: the convention ends at {high}")
         above = [sip_keyword(prefix, *k) for k, c in terms.items() if sum(k) > order and c != 0]
-        if above:
-            yield Finding("warning", ", ".join(above), f"above {keyword} {order}, so ignored")
+        yield from above_order(above, ", ".join(above), f"{keyword} {order}", "warning")
 
 
 def _low_terms(sip: SipHeader, size: tuple[int, int] | None) -> Iterator[Finding]:
@@ -146,15 +151,6 @@ def _low_terms(sip: SipHeader, size: tuple[int, int] | None) -> Iterator[Finding
         yield Finding(
             "note", ", ".join(named),
             f"constant or linear terms{extent}: astropy applies them, stwcs and gwcs drop them",
-        )  # fmt: skip
-
-
-def _repeated(sip: SipHeader) -> Iterator[Finding]:
-    values = values_by_keyword(sip)
-    for names in repeated_names(sip):
-        yield Finding(
-            "warning", ", ".join(names), f"the same value, {abs(values[names[0]]):.7g}: "
-            "one may have been copied over the other",
         )  # fmt: skip
 
 
@@ -194,36 +190,20 @@ def _inverse(
     if not inverse_is_used(sip):
         return
     closure = worst_closure(sip, size)
+    advice = "raise AP_ORDER" if max(sip.inverse_order) < SIP_ORDERS[1] else "better iterate"
+    yield from replace(_INVERSE, poor=_INVERSE.poor + advice).findings(
+        closure,
+        _exchanges(sip, size),
+        lambda: () if explain is None else explain(sip, size, closure),
+    )
+    yield from stated_closure(sip.closure, closure, "BDCLOS", "AP, BP leave")
+
+
+def _exchanges(sip: SipHeader, size: tuple[int, int]) -> Iterator[tuple[str, float]]:
+    """Closure after an exchange of p and q in AP and BP."""
     mirrored = replace(
         sip,
         ap={(j, i): c for (i, j), c in sip.ap.items()},
         bp={(j, i): c for (i, j), c in sip.bp.items()},
     )
-    keywords = "AP, BP"
-    if closure > _CLOSURE_GOOD and worst_closure(mirrored, size) < closure / 10:
-        yield Finding(
-            "error",
-            keywords,
-            f"index order: p and q are exchanged against A and B (closure {closure:.3g} px)",
-        )
-    elif closure > _CLOSURE_GOOD:
-        explained = [] if explain is None else list(explain(sip, size, closure))
-        yield from explained
-        if closure > _CLOSURE_BAD:
-            yield Finding(
-                "error", keywords, f"they miss the inverse of A, B by up to {closure:.3g} px: "
-                "a coefficient of one or the other is wrong",
-            )  # fmt: skip
-        elif not explained:
-            advice = (
-                "raise AP_ORDER" if max(sip.inverse_order) < SIP_ORDERS[1] else "better iterate"
-            )
-            yield Finding(
-                "warning",
-                keywords,
-                f"the inverse is wrong by up to {closure:.3g} px; {advice}",
-            )
-    if sip.closure is not None and closure > sip.closure * (1 + _CLOSURE_RELATIVE) + 1e-9:
-        yield Finding(
-            "error", "BDCLOS", f"states {sip.closure:.3g} px, and AP, BP leave {closure:.3g} px"
-        )
+    yield _INVERSE.where, worst_closure(mirrored, size)

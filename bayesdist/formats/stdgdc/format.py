@@ -42,6 +42,7 @@ from bayesdist.products.common.document import (
     finding_lines,
 )
 from bayesdist.products.common.parameters import parameters_hdu
+from bayesdist.products.common.rules import Missing, not_finite
 from bayesdist.utils.arrays import Float
 
 _BETWEEN = 997  # largest number of points per axis, between pixels, at which the tables are checked
@@ -198,7 +199,7 @@ def _extensions(file: StdGdc) -> Iterator[Finding]:
     for axis, n in (("XGC", nx), ("YGC", ny)):
         stated = file.header.get(f"NDIM_{axis}")
         if stated is None:
-            yield Finding("error", f"NDIM_{axis}", "is missing, and programs stop without it")
+            yield Missing(f"NDIM_{axis}", ", and programs stop without it").finding
         elif int(stated) != n:
             yield Finding("error", f"NDIM_{axis}", f"is {stated}, and the table has {n}")
 
@@ -206,10 +207,12 @@ def _extensions(file: StdGdc) -> Iterator[Finding]:
 def _tables(file: StdGdc) -> Iterator[Finding]:
     xgc, ygc = file.table("XGC"), file.table("YGC")
     for name in EXTENSIONS:
-        if name not in file.missing and not np.isfinite(file.table(name)).all():
-            yield Finding("error", name, "holds numbers that are not finite")
-            if name in ("XGC", "YGC"):
-                return
+        if name in file.missing:
+            continue
+        bad = not_finite(file.table(name), name, "holds numbers that are not finite")
+        yield from bad
+        if bad and name in ("XGC", "YGC"):
+            return
     dx, dy = np.gradient(xgc, axis=1).mean(), np.gradient(ygc, axis=0).mean()
     across = np.gradient(xgc, axis=0).mean(), np.gradient(ygc, axis=1).mean()
     if min(np.abs(across)) > max(abs(dx), abs(dy)):

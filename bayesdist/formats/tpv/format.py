@@ -44,10 +44,17 @@ from bayesdist.products.common.document import (
     Format,
     FormatSettings,
     finding_lines,
-    of_part,
-    repeated_values,
 )
 from bayesdist.products.common.parameters import parameters_content
+from bayesdist.products.common.rules import (
+    NO_SIZE,
+    LinearPart,
+    copies,
+    mixed_parities,
+    no_side_file,
+    of_part,
+    too_wide,
+)
 from bayesdist.products.common.wcs_text import describe_wcs
 
 NAME = "tpv.head"
@@ -167,7 +174,7 @@ def _describe(file: TpvFile) -> list[str]:
 
 
 _LARGE = 0.3  # fraction of the distance from CRPIX; no camera has a larger distortion
-_WIDE = 180.0  # degrees; an image this wide means that CD is in arcseconds
+_LINEAR = LinearPart("CD", "has the parity of a mirror image: east lies to the right of north")
 _ROUGH = 4096  # pixels; size assumed for a header without one
 
 
@@ -180,9 +187,7 @@ def lint_tpv(file: TpvFile) -> tuple[Finding, ...]:
         out += of_part(f"chip {head.number}" if several else "", findings)
     out += list(_mosaic(file))
     if file.side_file and file.content.path and file.content.beside(file.side_file) is None:
-        out.append(
-            Finding("warning", "BDPARAM", f"{file.side_file}, with the covariance, is not here")
-        )
+        out.append(no_side_file("BDPARAM", file.side_file, "with the covariance"))
     return tuple(out)
 
 
@@ -199,7 +204,7 @@ def _types(head: TpvHead) -> Iterator[Finding]:
     elif not all(t.endswith("-TPV") for t in head.ctype):
         yield Finding("error", "CTYPE1", f"the axes are {types}: only one of them is TPV")
     if head.size is None:
-        yield Finding("note", "NAXIS1", "the size of the image is not stated")
+        yield NO_SIZE
 
 
 def _first_terms(head: TpvHead) -> Iterator[Finding]:
@@ -226,19 +231,16 @@ def _first_terms(head: TpvHead) -> Iterator[Finding]:
 
 def _scale(head: TpvHead) -> Iterator[Finding]:
     det = float(np.linalg.det(head.cd))
-    if abs(det) <= 1e-12 * np.abs(head.cd).max() ** 2:
-        yield Finding("error", "CD", "is singular")
+    smallest = 1e-12 * np.abs(head.cd).max() ** 2
+    yield from _LINEAR.findings(det, smallest=smallest)
+    if abs(det) <= smallest:
         return
-    if det > 0:
-        yield Finding(
-            "note", "CD", "has the parity of a mirror image: east lies to the right of north"
-        )
     size = head.size or (_ROUGH, _ROUGH)
     width = np.sqrt(abs(det)) * max(size)
-    if width > _WIDE:
-        yield Finding(
-            "error", "CD", f"makes the image {width:.3g} degrees wide: its unit is the degree"
-        )
+    if wide := too_wide(
+        width, "CD", "makes the image {width:.3g} degrees wide: its unit is the degree"
+    ):
+        yield from wide
         return
     if 1 not in head.pv[0] or 1 not in head.pv[1]:
         return
@@ -264,8 +266,7 @@ def _copies(head: TpvHead) -> Iterator[Finding]:
         for m, value in pv.items()
         if m not in (1, 2)
     }
-    for group in repeated_values(named):
-        yield Finding("warning", ", ".join(group), "have one value: one may be a copy")
+    yield from copies(named, "have one value: one may be a copy")
     if head.radial:
         yield Finding("note", "PV", "has powers of r, which no polynomial follows exactly")
     high = [k for pv in head.pv for k, c in pv.items() if c and k in POWERS and sum(POWERS[k]) > 1]
@@ -274,9 +275,11 @@ def _copies(head: TpvHead) -> Iterator[Finding]:
 
 
 def _mosaic(file: TpvFile) -> Iterator[Finding]:
-    signs = {float(np.sign(np.linalg.det(head.cd))) for head in file.heads}
-    if len(signs) > 1:
-        yield Finding("warning", "CD", "chips are of different parity: check their order")
+    yield from mixed_parities(
+        (float(np.linalg.det(head.cd)) for head in file.heads),
+        "CD",
+        "chips are of different parity: check their order",
+    )
     points = {head.crval for head in file.heads}
     if len(points) > 1:
         yield Finding("note", "CRVAL", "chips touch the sky at different points")

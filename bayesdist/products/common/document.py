@@ -7,8 +7,8 @@ lossless reading concerns the bytes. A `Calibration` is made from a document.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from astropy.io import fits
@@ -64,37 +64,9 @@ class DistortionText:
 DistortionReader = Callable[[fits.Header, str], DistortionText | None]
 
 
-def of_part(part: str, findings: Iterable[Finding]) -> list[Finding]:
-    """Add the name of the part of a file in front of each finding; unchanged if `part` is empty."""
-    return [
-        replace(finding, where=f"{part}, {finding.where}" if part else finding.where)
-        for finding in findings
-    ]
-
-
-def repeated_values(coefficients: Mapping[str, float]) -> list[tuple[str, ...]]:
-    """Groups of names with non-zero values of equal magnitude, from coefficients by name.
-
-    Two fitted numbers never agree to the last digit: one of them has been copied over the other, as
-    in tables that went through text extraction.
-    """
-    groups: dict[float, list[str]] = {}
-    for name, value in coefficients.items():
-        if value != 0:
-            groups.setdefault(abs(value), []).append(name)
-    return [tuple(names) for names in groups.values() if len(names) > 1]
-
-
 def identity_lines(header: fits.Header) -> list[str]:
     """Lines of text with the keywords that identify a reference file."""
     return [f"  {k:<9} {header[k]}" for k in ("DESCRIP", "USEAFTER", "PEDIGREE") if k in header]
-
-
-def missing_identity(header: fits.Header) -> list[Finding]:
-    """Notes on missing keywords that a reference file should have."""
-    message = "is missing; reference files of the observatory have it"
-    keywords = ("USEAFTER", "PEDIGREE", "FILETYPE", "DESCRIP")
-    return [Finding("note", keyword, message) for keyword in keywords if keyword not in header]
 
 
 def finding_lines(findings: Sequence[Finding]) -> list[str]:

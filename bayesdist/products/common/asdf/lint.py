@@ -7,7 +7,6 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from astropy.modeling import Model, models
 
-from bayesdist.errors import BayesdistError
 from bayesdist.products.common.asdf.distortion import (
     AGREEMENT,
     DistortionFile,
@@ -16,14 +15,27 @@ from bayesdist.products.common.asdf.distortion import (
     recorded,
 )
 from bayesdist.products.common.asdf.transforms import exchanged, leaves, order_of, tables_of
-from bayesdist.products.common.document import Finding, finding_lines, repeated_values
+from bayesdist.products.common.document import Finding, finding_lines
 from bayesdist.products.common.record import error_lines
+from bayesdist.products.common.rules import (
+    Inverse,
+    LinearPart,
+    Missing,
+    copies,
+    not_finite,
+    record,
+    stated_closure,
+)
 from bayesdist.utils.arrays import Float
 
 PIXEL, SKY = ("pix", "pixel"), ("arcsec",)
-# Pixels: closure of a good inverse, and a closure that only a wrong coefficient explains.
-_CLOSURE_GOOD, _CLOSURE_BAD = 0.01, 0.5
-_CLOSURE_RELATIVE = 1e-2
+_INVERSE = Inverse(
+    "inverse",
+    good=0.01,
+    bad=0.5,
+    misses="misses the inverse of the model",
+    poor="leaves up to {closure:.3g} px; raise its order",
+)
 # Largest ratio of a pixel scale to its nominal value: filters and position change it by less.
 _SCALE_RATIO = 1.2
 _PER_DEGREE = 3600.0
@@ -37,8 +49,9 @@ def lint_distortion(file: DistortionFile) -> list[Finding]:
         findings.append(Finding("note", "meta.instrument", message))
         return findings
     x, y = file.grid()
-    if not np.isfinite(file.v2v3(x, y)).all():
-        return [*findings, Finding("error", "model", "gives values that are not finite")]
+    bad = not_finite(file.v2v3(x, y), "model", "gives values that are not finite")
+    if bad:
+        return [*findings, *bad]
     return [
         *findings,
         *_linear(file, file.size),
@@ -58,7 +71,7 @@ def _units(file: DistortionFile) -> Iterator[Finding]:
                 f"units are {unit!r}; pipelines take pixels to arcsec whatever stands here",
             )  # fmt: skip
         elif not unit:
-            yield Finding("warning", f"meta.{name}", f"is missing; it should be {wanted[0]!r}")
+            yield Missing(f"meta.{name}", f"; it should be {wanted[0]!r}", "warning").finding
 
 
 def _middle(file: DistortionFile, size: tuple[float, float]) -> tuple[Float, Float]:
@@ -72,12 +85,13 @@ def _linear(file: DistortionFile, size: tuple[float, float]) -> Iterator[Finding
     """Findings on parity and scale at the middle of the detector."""
     _, slope = _middle(file, size)
     area = float(np.linalg.det(slope))
-    if area > 0:
-        yield Finding(
-            "error", "parity",
+    if area != 0:
+        yield from LinearPart(
+            "parity",
             "V2, V3 run as x, y do: the image is a mirror image of the sky, which no imager of "
             f"{file.observatory} gives (VIdlParity is -1)",
-        )  # fmt: skip
+            level="error",
+        ).findings(area)
     scale = np.sqrt(abs(area))
     if file.detector is None:
         return
@@ -92,49 +106,28 @@ def _linear(file: DistortionFile, size: tuple[float, float]) -> Iterator[Finding
 def _inverse(file: DistortionFile) -> Iterator[Finding]:
     back = file.inverse
     if back is None:
-        yield Finding(
-            "error", "inverse",
-            "is missing: gwcs cannot go from the sky to pixels, and pipelines stop where they must",
-        )  # fmt: skip
+        yield Missing(
+            "inverse",
+            ": gwcs cannot go from the sky to pixels, and pipelines stop where they must",
+        ).finding
         return
     x, y = file.grid()
     closure = closure_of(file.model, back, x, y)
-    if not closure <= _CLOSURE_GOOD:
-        blamed = _exchanged(file.model, back, x, y, closure)
-        if blamed:
-            yield Finding(
-                "error", blamed, "the order of coefficients: powers of x and y are exchanged "
-                f"(closure {closure:.3g} px)",
-            )  # fmt: skip
-        elif not closure <= _CLOSURE_BAD:
-            yield Finding(
-                "error", "inverse", f"misses the inverse of the model by up to {closure:.3g} px: a "
-                "coefficient of one or the other is wrong",
-            )  # fmt: skip
-        else:
-            yield Finding("warning", "inverse", f"leaves up to {closure:.3g} px; raise its order")
-    stated = file.stated_closure
-    if stated is not None and closure > stated * (1 + _CLOSURE_RELATIVE) + 1e-9:
-        yield Finding(
-            "error", "bayesdist.inverse",
-            f"states {stated:.3g} px, and the inverse leaves {closure:.3g} px",
-        )  # fmt: skip
+    exchanges = (
+        (part, closure_of(forward, inverse, x, y))
+        for part, forward, inverse in _exchanged(file.model, back)
+    )
+    yield from _INVERSE.findings(closure, exchanges)
+    yield from stated_closure(
+        file.stated_closure, closure, "bayesdist.inverse", "the inverse leaves"
+    )
 
 
-def _exchanged(model: Model, back: Model, x: Float, y: Float, closure: float) -> str:
-    """Part in which exchanging powers of x and y makes forward and inverse agree; empty if none."""
-    # if powers are exchanged in both parts they nearly agree again, so the better one is right
-    smallest = closure / 10
-    blamed = ""
+def _exchanged(model: Model, back: Model) -> Iterator[tuple[str, Model, Model]]:
+    """Part in which powers of x and y are exchanged, with forward and inverse model."""
     for lowest in (1, 2):
-        for part, forward, inverse in (
-            ("inverse", model, exchanged(back, lowest)),
-            ("model", exchanged(model, lowest), back),
-        ):
-            remaining = closure_of(forward, inverse, x, y)
-            if remaining < smallest:
-                smallest, blamed = remaining, part
-    return blamed
+        yield "inverse", model, exchanged(back, lowest)
+        yield "model", exchanged(model, lowest), back
 
 
 def _repeated(model: Model) -> Iterator[Finding]:
@@ -146,9 +139,7 @@ def _repeated(model: Model) -> Iterator[Finding]:
             for name, c in zip(polynomial.param_names, polynomial.parameters, strict=True)
             if sum(map(int, name[1:].split("_"))) > 1
         }
-        for names in repeated_values(values):
-            message = f"the same value, {abs(values[names[0]]):.7g}: one may have been copied"
-            yield Finding("warning", ", ".join(names), f"{message} over the other")
+        yield from copies(values)
 
 
 def _record(file: DistortionFile) -> Iterator[Finding]:
@@ -156,17 +147,14 @@ def _record(file: DistortionFile) -> Iterator[Finding]:
     if file.record is None:
         yield Finding("note", "bayesdist", "is not there: the file states no uncertainty")
         return
-    try:
-        calibration = recorded(file, file.record)
-    except BayesdistError as error:
-        yield Finding("error", "bayesdist", error.cause)
-        return
-    far = departure(file, calibration)
-    if not far <= AGREEMENT:
-        yield Finding(
-            "error", "bayesdist.parameters",
-            f"are another map than the model, by up to {far:.3g} px: one of them has been changed",
-        )  # fmt: skip
+    stored = file.record
+    yield from record(
+        "bayesdist",
+        lambda: departure(file, recorded(file, stored)),
+        AGREEMENT,
+        "are another map than the model, by up to {far:.3g} px: one of them has been changed",
+        differs_at="bayesdist.parameters",
+    )
 
 
 def describe_distortion(file: DistortionFile, findings: Sequence[Finding]) -> list[str]:
