@@ -8,7 +8,6 @@ import pytest
 
 from bayesdist.data import Matches
 from bayesdist.errors import InputError
-from bayesdist.missions.wise.pairs import files as rvb_files
 from bayesdist.missions.wise.pairs.read import read_rvb, stream_rvb
 from bayesdist.missions.wise.pairs.run_input import open_rvb
 from bayesdist.missions.wise.pairs.rvb_pairs import RvbPairs, write_rvb
@@ -93,11 +92,11 @@ def test_what_leaves_nothing_or_cannot_be_done_is_refused(rng):
         RvbBlock(bluest=0)
 
 
-def test_written_pairs_are_read_again(rng, tmp_path, monkeypatch):
+def test_written_pairs_are_read_again(rng, tmp_path):
     path = write(rvb_table(rng), tmp_path / "a.parquet")
     expected = read_rvb(path, band="W2")
-    monkeypatch.setattr(rvb_files, "BATCH", 41)
-    assert write_rvb(stream_rvb(path, band="W2"), tmp_path / "out") == len(expected)
+    batches = stream_rvb(path, band="W2", batch=41)
+    assert write_rvb(batches, tmp_path / "out") == len(expected)
     found = read_rvb(tmp_path / "out")
     assert len(list((tmp_path / "out").iterdir())) > 3
     for name in ARRAYS:

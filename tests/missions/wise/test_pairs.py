@@ -13,7 +13,6 @@ from astropy.time import Time
 
 from bayesdist.data import Matches, open_matches, write_partitioned
 from bayesdist.errors import InputError
-from bayesdist.missions.wise.pairs import files as rvb_files
 from bayesdist.missions.wise.pairs.radial_limit import RadialLimit
 from bayesdist.missions.wise.pairs.read import read_rvb, rvb_bands, stream_rvb
 from bayesdist.missions.wise.pairs.rvb_pairs import RvbPairs, colour_of
@@ -89,12 +88,11 @@ def test_the_pairs_of_a_band_are_its_rows(rng, tmp_path, suffix):
         assert len(set(matches.exposure_names)) == len(np.unique(named))
 
 
-def test_parquet_in_small_pieces_is_the_ipac_table(rng, tmp_path, monkeypatch):
+def test_parquet_in_small_pieces_is_the_ipac_table(rng, tmp_path):
     table = rvb_table(rng)
     whole = read_rvb(write(table, tmp_path / "a.tbl"), band="w2")
     path = write(table, tmp_path / "a.parquet")
-    monkeypatch.setattr(rvb_files, "BATCH", 41)
-    pieces = list(stream_rvb(path, band="2"))
+    pieces = list(stream_rvb(path, band="2", batch=41))
     assert len(pieces) == 8 and sum(len(p) for p in pieces) == len(whole)
     assert_same(RvbPairs.concatenate(pieces), whole)
     # what is written from the pieces is what a fit opens

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
+
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
@@ -18,7 +20,8 @@ from bayesdist.missions.wise.published import (
     SAMPLE_SIZES,
     WISE_BANDS,
 )
-from bayesdist.missions.wise.simulate import files, sets, wise_set, write_wise_set
+from bayesdist.missions.wise.simulate import wise_set, write_wise_set
+from bayesdist.missions.wise.simulate.sets import WiseSet
 from bayesdist.missions.wise.simulate.survey import match_radius
 from bayesdist.missions.wise.simulated_pairs import simulate_sets
 
@@ -170,9 +173,8 @@ def test_a_fit_finds_the_published_coefficients(tmp_path, band):
     assert abs(fit.chi2 / fit.dof - 1) < 5 * np.sqrt(2 / fit.dof)
 
 
-def test_files_hold_the_chunks(tmp_path, monkeypatch):
-    monkeypatch.setattr(sets, "CHUNK", 1000)
-    one = wise_set("W2", pairs=3500, seed=2, false_fraction=0.1)
+def test_files_hold_the_chunks(tmp_path):
+    one = wise_set("W2", pairs=3500, seed=2, false_fraction=0.1, chunk_pairs=1000)
     n_false = write_wise_set(one, tmp_path)
     back = read_matches(tmp_path / "w2", columns=COLUMNS)
     chunks = [one.chunk(k) for k in range(4)]
@@ -195,10 +197,9 @@ def test_files_hold_the_chunks(tmp_path, monkeypatch):
     assert truth.meta["false_matches"] == n_false == false.sum() and truth.meta["seed"] == 2
 
 
-def test_neither_threads_nor_other_bands_change_a_set(tmp_path, monkeypatch):
-    monkeypatch.setattr(sets, "CHUNK", 500)
+def test_neither_threads_nor_other_bands_change_a_set(tmp_path):
     for folder, threads in (("a", 1), ("b", 3)):
-        one = wise_set("W3", pairs=2600, seed=5)
+        one = wise_set("W3", pairs=2600, seed=5, chunk_pairs=500)
         write_wise_set(one, tmp_path / folder, threads=threads)
     parts = sorted(path.name for path in (tmp_path / "a" / "w3").iterdir())
     assert len(parts) == 6
@@ -265,10 +266,11 @@ def test_what_cannot_be_simulated_is_refused(tmp_path):
         simulated(tmp_path / "file")
 
 
-def test_force_leaves_nothing_of_the_set_before(tmp_path, monkeypatch):
-    monkeypatch.setattr(sets, "CHUNK", 500)
+def test_force_leaves_nothing_of_the_set_before(tmp_path):
     new = {"pairs": 900, "partition_pattern": False}
     simulated(tmp_path / "a")
+    four_parts = wise_set("W1", pairs=2000, chunk_pairs=500)
+    write_wise_set(four_parts, tmp_path / "a", force=True)
     simulated(tmp_path / "a", force=True, **new)
     simulated(tmp_path / "b", **new)
     a, b = (
@@ -278,16 +280,18 @@ def test_force_leaves_nothing_of_the_set_before(tmp_path, monkeypatch):
     assert a == b
 
 
-def test_what_fails_half_way_leaves_nothing(tmp_path, monkeypatch):
-    monkeypatch.setattr(sets, "CHUNK", 100)
-    write = files.write_columns
+class BreaksOff(WiseSet):
+    """Set that fails at its fifth chunk."""
 
-    def broken(path, columns, units):
-        if path.name == "part-00004.parquet":
+    def chunk(self, k):
+        if k == 4:
             raise InputError("disk is full")
-        write(path, columns, units)
+        return super().chunk(k)
 
-    monkeypatch.setattr(files, "write_columns", broken)
+
+def test_what_fails_half_way_leaves_nothing(tmp_path):
+    good = wise_set("W1", pairs=1000, chunk_pairs=100)
+    broken = BreaksOff(**{field.name: getattr(good, field.name) for field in fields(good)})
     with pytest.raises(InputError, match="disk is full"):
-        write_wise_set(wise_set("W1", pairs=1000), tmp_path)
+        write_wise_set(broken, tmp_path)
     assert not list(tmp_path.rglob("*.*"))

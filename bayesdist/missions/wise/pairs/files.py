@@ -61,8 +61,10 @@ class RvbFile:
     contents: Table | ParquetPart
     found: Mapping[str, str]  # column name by quantity
 
-    def blocks(self, keys: Sequence[str]) -> Iterator[tuple[TableColumns, int, Place]]:
-        """Read some quantities block by block.
+    def blocks(
+        self, keys: Sequence[str], size: int = BATCH
+    ) -> Iterator[tuple[TableColumns, int, Place]]:
+        """Read some quantities in blocks of at most `size` rows.
 
         Yields
         ------
@@ -81,7 +83,7 @@ class RvbFile:
         columns = list(dict.fromkeys(self.found[key] for key in keys if key in self.found))
         labels = {self.found[key] for key in ("band", "exposure") if key in self.found}
         labels |= {self.found["epoch"]} & part.texts if "epoch" in self.found else set()
-        for block in part.blocks(columns, encoded=labels & set(columns), size=BATCH):
+        for block in part.blocks(columns, encoded=labels & set(columns), size=size):
             yield block, block.first, part.place(block.first)
 
     def column(self, table: TableColumns, key: str, place: Place) -> SourceColumn:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from astropy.table import Column
 
+from bayesdist.data.batches import BATCH
 from bayesdist.data.matches import Matches
 from bayesdist.data.reading.columns import match_columns
 from bayesdist.data.reading.options import ReadOptions, check_sigma, refuse_missing_errors
@@ -67,6 +68,7 @@ def stream_rvb(
     sigma: str | float = "columns",
     pixel_origin: int = 1,
     size: tuple[float, float] | None = None,
+    batch: int = BATCH,
 ) -> Iterator[RvbPairs]:
     """Read the RvB pairs of one band in batches.
 
@@ -94,12 +96,15 @@ def stream_rvb(
         Coordinate of the centre of the first pixel in the file.
     size : tuple of float, optional
         Columns and rows of the array; by default those of the band.
+    batch : int, optional
+        Largest number of rows of a Parquet file that are read together.
 
     Yields
     ------
     RvbPairs
-        At most `BATCH` distinct pairs.  If the file has no other magnitude, that of the band is
-        used, provided that all pairs of the batch have one.
+        Distinct pairs: at most `batch` of a Parquet file, or all of another table.  If the file
+        has no other magnitude, that of the band is used, provided that all pairs of the batch
+        have one.
 
     Raises
     ------
@@ -114,7 +119,7 @@ def stream_rvb(
     size = size or WISE_ARRAYS[band].size
     check = ArrayCheck(band, size)
     for file in files:
-        for table, first, place in file.blocks(list(RVB_ALIASES)):
+        for table, first, place in file.blocks(list(RVB_ALIASES), batch):
             selected = np.ones(len(table), bool)
             if "band" in file.found:
                 codes, names = file.bands(table, place)

@@ -84,6 +84,8 @@ class WiseSet:
         Distribution of false matches.
     pattern : PartitionPattern or None
         Pattern in the residuals, if any.
+    chunk_pairs : int
+        Maximum number of pairs per chunk.
     """
 
     band: str
@@ -95,6 +97,7 @@ class WiseSet:
     survey: Survey
     false_matches: FalseMatches
     pattern: PartitionPattern | None
+    chunk_pairs: int = CHUNK
 
     @property
     def array(self) -> WiseArray:
@@ -104,7 +107,7 @@ class WiseSet:
     @cached_property
     def edges(self) -> list[int]:
         """First row of each chunk, and the total number of rows."""
-        return even_edges(self.pairs, CHUNK)
+        return even_edges(self.pairs, self.chunk_pairs)
 
     def chunk(self, k: int) -> PairChunk:
         """Generate the pairs of rows ``edges[k]`` to ``edges[k + 1]``.
@@ -186,6 +189,7 @@ def wise_set(
     seed: int = 1,
     false_fraction: float = 0.03,
     partition: bool = False,
+    chunk_pairs: int = CHUNK,
 ) -> WiseSet:
     """Simulated set of pairs of WISE detections and 2MASS stars.
 
@@ -201,6 +205,8 @@ def wise_set(
         Expected fraction of false matches among the pairs.
     partition : bool, optional
         True to add the pattern due to the partition of the point-spread function.
+    chunk_pairs : int, optional
+        Maximum number of pairs that are generated and written together.
 
     Returns
     -------
@@ -230,6 +236,7 @@ def wise_set(
         survey=frames,
         false_matches=false_matches(frames, WISE_ARRAYS[band].scale, false_fraction),
         pattern=pattern,
+        chunk_pairs=chunk_pairs,
     )
 
 
