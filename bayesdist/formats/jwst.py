@@ -7,7 +7,13 @@ from typing import Any, Literal
 
 from bayesdist.errors import FormatError, InputError
 from bayesdist.products.common.asdf.format import Observatory
-from bayesdist.products.common.asdf.tree import Detector, PlacedSettings, tree_of
+from bayesdist.products.common.asdf.tree import (
+    Detector,
+    InstrumentMeta,
+    PlacedSettings,
+    ReferenceMeta,
+    tree_of,
+)
 from bayesdist.products.common.content import Content
 from bayesdist.products.common.document import Finding
 
@@ -67,7 +73,7 @@ def module_and_channel(detector: str) -> tuple[str, str]:
     return detector[3], "LONG" if detector in _LONG else "SHORT"
 
 
-def _instrument(detector: str, settings: Settings) -> dict[str, Any]:
+def _instrument(detector: str, settings: Settings) -> InstrumentMeta:
     """Node meta.instrument; InputError for a detector that the instrument does not have."""
     instrument = settings.instrument
     detectors = _DETECTORS[instrument]
@@ -77,7 +83,7 @@ def _instrument(detector: str, settings: Settings) -> dict[str, Any]:
             where="products.jwst",
             do=f"choose one of {', '.join(detectors)}",
         )
-    meta: dict[str, Any] = {"name": instrument, "detector": detector}
+    meta: InstrumentMeta = {"name": instrument, "detector": detector}
     if instrument == "NIRCAM":
         meta["module"], meta["channel"] = module_and_channel(detector)
     if settings.filter:
@@ -95,7 +101,7 @@ _REQUIRED = ("reftype", "description", "author", "pedigree", "useafter", "telesc
 _NIRCAM = ("module", "channel", "p_pupil")
 
 
-def _meta(detector: str, settings: Settings) -> dict[str, Any]:
+def _meta(detector: str, settings: Settings) -> ReferenceMeta:
     """Node meta of the file of one detector."""
     return {
         "telescope": "JWST",

@@ -8,7 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 from bayesdist.errors import FormatError, InputError
 from bayesdist.products.common.asdf.format import Observatory
-from bayesdist.products.common.asdf.tree import Detector, PlacedSettings, tagged, tree_of
+from bayesdist.products.common.asdf.tree import (
+    Detector,
+    PlacedSettings,
+    ReferenceMeta,
+    tagged,
+    tree_of,
+)
 from bayesdist.products.common.content import Content
 from bayesdist.products.common.document import Finding
 
@@ -50,7 +56,7 @@ _WFI = Detector((4088.0, 4088.0), 0.1075)
 _REQUIRED = ("reftype", "description", "author", "pedigree", "useafter", "telescope", "origin")
 
 
-def _meta(detector: str, settings: Settings) -> dict[str, Any]:
+def _meta(detector: str, settings: Settings) -> ReferenceMeta:
     """Node meta of the file of one detector; InputError for values outside the schema."""
     for key, value, allowed in (
         ("detector", detector, DETECTORS),

@@ -321,10 +321,13 @@ class _Row:
     place: slice  # indices of the chip's numbers in the covariance
 
     @property
-    def key(self) -> dict[str, Any]:
+    def key(self) -> dict[str, str | float]:
         """Columns that identify the row."""
         direction = "FORWARD" if self.inverse is None else "INVERSE"
-        named = {"DETCHIP": self.numbers.chip.number, "DIRECTION": direction}
+        named: dict[str, str | float] = {
+            "DETCHIP": self.numbers.chip.number,
+            "DIRECTION": direction,
+        }
         return named | _by_wheel(self.filters)
 
     def value(self, name: str) -> float:

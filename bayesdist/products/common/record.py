@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
-from typing import Any
+from typing import Any, NotRequired, TypedDict
 
 import numpy as np
 from pydantic import BaseModel, Field, TypeAdapter
@@ -126,13 +126,86 @@ def at_date(
     )
 
 
+class ParametersRecord(TypedDict):
+    """Parameters of the polynomials."""
+
+    meaning: str
+    unit: str
+    order: int
+    names: list[str]
+    values: Float  # (D,)
+
+
+class ChipRecord(TypedDict):
+    """Chip of the parameters; sizes and positions in pixels."""
+
+    number: int | None
+    name: str
+    size: list[float]
+    reference_pixel: list[float]
+
+
+class PlaneRecord(TypedDict):
+    """Plane of (u, v); see `bayesdist.calibration.plane.Plane`."""
+
+    kind: str
+    v2v3: list[float] | None
+    v3_angle: float | None
+    parity: int | None
+
+
+class TableRecord(TypedDict):
+    """Look-up table, apart from its values, which are in the transform."""
+
+    filter: str
+    first: list[float]
+    step: list[float]
+    sigma: NotRequired[Float]  # (2, ny, nx)
+
+
+class ProvenanceRecord(TypedDict):
+    """Origin of the parameters."""
+
+    software: str
+    source: str
+    instrument: str
+    detector: str
+    filter: str
+    epoch: float | None  # decimal years
+    kind: str
+    converged: bool | None
+    notes: list[str]
+
+
+class InverseRecord(TypedDict):
+    """Accuracy of the inverse."""
+
+    closure_pix: float
+
+
+class CalibrationRecord(TypedDict):
+    """Record of a calibration of one chip at one date, as stored in a file."""
+
+    version: int
+    parameters: ParametersRecord
+    errors: str
+    gauge: str
+    chip: ChipRecord
+    plane: PlaneRecord
+    tables: list[TableRecord]
+    provenance: ProvenanceRecord
+    inverse: NotRequired[InverseRecord]
+    further_errors: NotRequired[list[dict[str, Any]]]
+    covariance: NotRequired[Float]  # (D, D)
+
+
 def record_of(
     calibration: Calibration,
     source: Calibration,
     *,
     epoch: float | None = None,
     closure: float | None = None,
-) -> dict[str, Any]:
+) -> CalibrationRecord:
     """Record of a calibration of one chip at one date.
 
     `source` is the calibration that it was made from, and `closure` the largest error of the
@@ -141,7 +214,7 @@ def record_of(
     model, plane = calibration.model, calibration.plane
     [chip] = model.chips
     convergence = source.solution.convergence
-    record: dict[str, Any] = {
+    record: CalibrationRecord = {
         "version": VERSION,
         "parameters": {
             "meaning": "Legendre products over the chip, pixels to (u, v)",
@@ -196,8 +269,8 @@ def _gauge(source: Calibration) -> str:
     return "Position and angle of the aperture in V2, V3 are taken as exact."
 
 
-def _table_entry(table: LookupTable) -> dict[str, Any]:
-    entry: dict[str, Any] = {
+def _table_entry(table: LookupTable) -> TableRecord:
+    entry: TableRecord = {
         "filter": table.filter,
         "first": list(table.first),
         "step": list(table.step),

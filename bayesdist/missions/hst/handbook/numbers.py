@@ -6,7 +6,7 @@ Only numbers in the text of the section are included, not its Table 4.1.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TypedDict
 
 import numpy as np
 
@@ -120,9 +120,18 @@ def acs_detector(name: str) -> str:
     return key
 
 
+class HandbookRow(TypedDict):
+    """Row of the table that compares a detector with the published values."""
+
+    quantity: str
+    unit: str
+    published: str  # text as printed, or empty
+    value: float
+
+
 def handbook_rows(
     numbers: DetectorNumbers, *, scale: float, unit: str, detector: str = ""
-) -> list[dict[str, Any]]:
+) -> list[HandbookRow]:
     """Rows of the table that compares a detector with the published values.
 
     Parameters
@@ -137,8 +146,8 @@ def handbook_rows(
 
     Returns
     -------
-    list of dict
-        Rows with the keys quantity, unit, published (text as printed, or empty) and value.
+    list of HandbookRow
+        Rows in the order of the handbook.
     """
     n = numbers
     angle = unit if unit != "pix" else "pix of u, v"

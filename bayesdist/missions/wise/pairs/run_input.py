@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, TypedDict
 
 from bayesdist.app.kinds.matches.sources import MatchSource, is_large
 from bayesdist.app.store.rundir import PAIRS, RunDirectory, part_files
@@ -201,7 +201,18 @@ def load_rvb(
     return SelectedPairs(lambda: batches, data.rvb, size).table()
 
 
-def _options(data: RvbData, size: tuple[float, float]) -> dict[str, Any]:
+class _Options(TypedDict):
+    """Options of `stream_rvb` and `open_rvb`."""
+
+    band: str | None
+    columns: Mapping[str, str] | None
+    unit: str
+    sigma: str | float
+    pixel_origin: int
+    size: tuple[float, float]
+
+
+def _options(data: RvbData, size: tuple[float, float]) -> _Options:
     """Options of `stream_rvb` and `open_rvb`."""
     return {
         "band": data.band,

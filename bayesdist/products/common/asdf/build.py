@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from astropy.modeling import Model
@@ -19,7 +18,7 @@ from bayesdist.products.common.asdf.transforms import tables_of
 from bayesdist.products.common.asdf.tree import Detector, PlacedSettings
 from bayesdist.products.common.coefficients import require_regular
 from bayesdist.products.common.document import BuildOptions
-from bayesdist.products.common.record import at_date, record_of
+from bayesdist.products.common.record import CalibrationRecord, at_date, record_of
 from bayesdist.utils.arrays import Float
 
 
@@ -31,7 +30,7 @@ class ChipTransform:
     chip: int
     chip_name: str
     model: Model  # pixels to V2, V3, with its inverse
-    record: dict[str, Any]
+    record: CalibrationRecord
     closure: float  # pixels; largest error of the inverse
 
     @property

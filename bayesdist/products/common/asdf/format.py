@@ -10,6 +10,7 @@ from bayesdist.calibration.calibration import Calibration
 from bayesdist.products.common.asdf.tree import (
     Detector,
     PlacedSettings,
+    ReferenceMeta,
     is_asdf,
     packed,
     plain,
@@ -23,6 +24,7 @@ from bayesdist.products.common.document import (
     Format,
 )
 from bayesdist.products.common.read_back import ReadBack
+from bayesdist.products.common.record import CalibrationRecord
 
 # these need astropy.modeling, which takes longer to import than other files take to read
 if TYPE_CHECKING:
@@ -45,9 +47,9 @@ class Observatory(Generic[Settings]):
     detector: Callable[[Mapping[str, Any]], Detector | None]  # takes the node meta.instrument
     lint_meta: Callable[[Mapping[str, Any]], Iterable[Finding]]  # takes the node meta
     # (detector name, settings) -> node meta; InputError for unknown values
-    meta: Callable[[str, Settings], dict[str, Any]]
+    meta: Callable[[str, Settings], ReferenceMeta]
     # (meta, transform, record, file name) -> tree of the file
-    tree: Callable[[dict[str, Any], Model, dict[str, Any], str], dict[str, Any]]
+    tree: Callable[[ReferenceMeta, Model, CalibrationRecord, str], Mapping[str, object]]
     units: tuple[str, str] = ("", "")  # of pixels and positions if a file states none
 
     def format(self, title: str, rank: int, settings: type[Settings]) -> Format:
@@ -113,7 +115,8 @@ class Observatory(Generic[Settings]):
             meta = self.meta(detector, settings)
             refuse_larger(transform, detector, self.detector(meta["instrument"]), location)
             instrument = meta["instrument"]["name"]
-            transform.record["provenance"] |= {"instrument": instrument, "detector": detector}
+            provenance = transform.record["provenance"]
+            provenance["instrument"], provenance["detector"] = instrument, detector
             usual = f"{self.key}_{instrument}_{detector}_distortion.asdf".lower()
             file = options.named(usual, several=several)
             tree = self.tree(meta, transform.model, transform.record, file)

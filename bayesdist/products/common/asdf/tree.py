@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NotRequired, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,45 @@ from bayesdist.model.basis import MAX_ORDER
 from bayesdist.products.common.content import Content
 from bayesdist.products.common.document import FormatSettings
 
+if TYPE_CHECKING:
+    from astropy.time import Time
+
 DESCRIPTION = "Geometric distortion with its uncertainty, by bayesdist"
+
+
+class Identity(TypedDict):
+    """Metadata that every reference file contains."""
+
+    pedigree: str
+    useafter: str | Time
+    author: str
+    description: str
+
+
+class InstrumentMeta(TypedDict):
+    """Node meta.instrument of a file that is written."""
+
+    name: str
+    detector: str
+    module: NotRequired[str]
+    channel: NotRequired[str]
+    filter: NotRequired[str]
+    pupil: NotRequired[str]
+    p_pupil: NotRequired[str]
+    optical_element: NotRequired[str]
+
+
+class ReferenceMeta(Identity):
+    """Node meta of a file that is written."""
+
+    telescope: str
+    origin: NotRequired[str]
+    reftype: str
+    model_type: NotRequired[str]
+    instrument: InstrumentMeta
+    exposure: NotRequired[dict[str, str]]
+    input_units: str
+    output_units: str
 
 
 class PlacedSettings(FormatSettings):
@@ -38,10 +76,14 @@ class PlacedSettings(FormatSettings):
     parity: Literal[-1, 1] | None = None
     inverse_order: Annotated[int, Field(ge=1, le=12)] | None = None
 
-    def identity(self) -> dict[str, str]:
+    def identity(self) -> Identity:
         """Metadata that every reference file contains."""
-        names = ("pedigree", "useafter", "author", "description")
-        return {name: getattr(self, name) for name in names}
+        return {
+            "pedigree": self.pedigree,
+            "useafter": self.useafter,
+            "author": self.author,
+            "description": self.description,
+        }
 
 
 @dataclass(frozen=True)
