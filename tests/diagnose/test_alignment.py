@@ -22,7 +22,7 @@ from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer import build_model, fit_linear, residuals
 from bayesdist.infer.stars.likelihood import Clip
 from bayesdist.infer.stars.shards import LocalShards
-from bayesdist.missions.wise.assess.contradictions import (
+from bayesdist.missions.wise.assess.account import (
     contradictions_across,
     contradictions_within,
 )

@@ -7,7 +7,7 @@ import pytest
 
 from bayesdist.errors import InputError
 from bayesdist.missions.hst.simulate import ACS_FILTERS, acs_solution
-from bayesdist.missions.hst.simulate.tables import detector_tables, filter_tables
+from bayesdist.missions.hst.simulate.making import detector_tables, filter_tables
 
 # Tables 1-3: chip, RDATE: (alpha, beta)
 A_2 = {

@@ -21,7 +21,7 @@ from bayesdist.formats.idctab.table import combination_of, read_idctab
 from bayesdist.infer.solution.transforms import reference_gauge
 from bayesdist.missions.hst.release import Period, Release, write_release
 from bayesdist.missions.hst.simulate import acs_solution
-from bayesdist.missions.hst.simulate.tables import detector_tables, filter_tables
+from bayesdist.missions.hst.simulate.making import detector_tables, filter_tables
 from bayesdist.model.lookup import LookupTable, corrected
 from tests.reduced import case_in_full
 

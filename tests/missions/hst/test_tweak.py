@@ -18,7 +18,7 @@ from bayesdist.calibration.calibration import Calibration, calibration_of
 from bayesdist.data.sky import mean_direction, tangent_plane
 from bayesdist.diagnose.overlap import Alignment, align
 from bayesdist.missions.hst.release import Period, write_release
-from bayesdist.missions.hst.simulate.tables import detector_tables, filter_tables
+from bayesdist.missions.hst.simulate.making import detector_tables, filter_tables
 from bayesdist.model.lookup import LookupTable, corrected
 from tests.reduced import only_in_full
 

@@ -21,8 +21,7 @@ from bayesdist.missions.wise.published import (
     WISE_BANDS,
 )
 from bayesdist.missions.wise.simulate import wise_set, write_wise_set
-from bayesdist.missions.wise.simulate.sets import WiseSet
-from bayesdist.missions.wise.simulate.survey import match_radius
+from bayesdist.missions.wise.simulate.sets import WiseSet, match_radius
 from bayesdist.missions.wise.simulated_pairs import simulate_sets
 
 COLUMNS = {"sigma_u": "sigma", "sigma_v": "sigma", "exposure": "frame"}

@@ -3,19 +3,37 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cholesky
+from scipy.sparse import csr_array
 
+from bayesdist.data.detections import Detections
 from bayesdist.data.exposures import Exposure, ExposureLog
 from bayesdist.errors import InputError
-from bayesdist.missions.hst.simulate.detections import Detector, star_list
-from bayesdist.missions.hst.simulate.distortion import ACS_FILTERS, acs_solution
+from bayesdist.missions.hst.simulate.distortion import (
+    ACS_FILTERS,
+    CHIPS,
+    EPOCH0,
+    HALF,
+    acs_solution,
+)
 from bayesdist.missions.hst.simulate.pointings import exposures_of, frames_of
-from bayesdist.missions.hst.simulate.stars import measured_catalogs, true_stars
-from bayesdist.missions.hst.simulate.tables import detector_tables, filter_tables
-from bayesdist.missions.hst.simulate.truth import AcsCampaign, AcsTruth
+from bayesdist.missions.hst.simulate.stars import (
+    FAINT,
+    centroid_error,
+    measured_catalogs,
+    true_stars,
+)
+from bayesdist.missions.hst.simulate.truth import AcsCampaign, AcsTruth, DetectionTruth
+from bayesdist.model import Chip, PolynomialBasis
+from bayesdist.model.grid import mesh
+from bayesdist.model.lookup import LookupTable
+from bayesdist.utils.arrays import Bool, Float
 
 BASE = "F606W"
 FEWEST = 100  # minimum number of stars
@@ -167,3 +185,234 @@ def _check(filters: Sequence[str], settings: Mapping[str, Any]) -> None:
         for name in names:
             if not low <= settings[name] < high:
                 raise InputError(f"{name} is {settings[name]:g}", where=name, do=f"give {words}")
+
+
+# -- detections -----------------------------------------------------------------------------------
+
+
+BORDER = 5.0  # pixels: stars closer to an edge are not measured
+LIMIT, SOFT = -7.5, 0.3  # magnitude of 50 % completeness, and width of its decline
+SATURATED = -14.0  # magnitude of saturation (Figure 5)
+LAUNCH = 2002.2  # decimal year of the installation of ACS
+CTE = 0.1  # pixels after 12 years and 2048 transfers at magnitude -9 (Section 3)
+REACH = 2.0  # pixels: closer neighbours are blended
+
+
+@dataclass(frozen=True)
+class Detector:
+    """Errors of the detections of an exposure."""
+
+    centroid: float = 1.0  # factor on the centroid errors; 0 gives exact positions
+    false: float = 0.05  # fraction of false detections in a list (cosmic rays, artefacts)
+    blended: float = 0.01  # fraction of the stars that are displaced by a close neighbour
+    cte: bool = False  # True if charge-transfer inefficiency displaces the positions
+
+
+def cte_shift(chip: int, y: Float, mag: Float, epoch: float) -> Float:
+    """Shift (N,) along y in pixels due to charge-transfer inefficiency (CTE).
+
+    According to ACS ISR 2015-06, Section 3, it is about 0.1 px and increases with time, with the
+    number of transfers and towards faint stars.  WFC1 is read out at its upper edge and WFC2 at its
+    lower edge; the trails point away from the edge.
+    """
+    transfers = (2048.5 - y if chip == 1 else y - 0.5) / 2048.0
+    size = CTE * max(epoch - LAUNCH, 0.0) / 12.0 * transfers * 10 ** (0.15 * (mag + 9.0))
+    return -size if chip == 1 else size
+
+
+def star_list(
+    truth: AcsTruth, exposure: str, detector: Detector, rng: np.random.Generator
+) -> tuple[Detections, DetectionTruth]:
+    """Simulated detections of an exposure in random order, and their truth."""
+    e = truth.frames.names.index(exposure)
+    epoch = truth.log[exposure].epoch
+    u, v = truth.stars.at(epoch)
+    parts = []
+    for chip in truth.model.chips:
+        x, y = truth.to_pixels(exposure, u, v, chip.number)
+        on_chip = np.flatnonzero(_inside(x, y, chip))
+        mag = truth.stars.mag[on_chip]
+        detected = rng.uniform(size=len(on_chip)) < 1.0 / (1.0 + np.exp((mag - LIMIT) / SOFT))
+        stars, mag = on_chip[detected], mag[detected]
+        part = _measured(chip, x[stars], y[stars], mag, epoch, detector, rng)
+        part["star"] = stars
+        parts += [part, _junk(chip, len(stars), detector.false, rng)]
+    columns: dict[str, Any] = {
+        key: np.concatenate([part[key] for part in parts]) for key in parts[0]
+    }
+    columns["mag"] += truth.frames.zero_point[e]
+    order = rng.permutation(len(columns["x"]))
+    columns = {key: values[order] for key, values in columns.items()}
+    star, blended = columns.pop("star"), columns.pop("blended")
+    return Detections(exposure_names=(exposure,), **columns), DetectionTruth(star, blended)
+
+
+def _inside(x: Float, y: Float, chip: Chip) -> Bool:
+    nx, ny = chip.size
+    out: Bool = (x >= BORDER) & (x <= nx + 1 - BORDER) & (y >= BORDER) & (y <= ny + 1 - BORDER)
+    return out  # NaN is not inside
+
+
+def _measured(
+    chip: Chip,
+    x: Float,
+    y: Float,
+    mag: Float,
+    epoch: float,
+    detector: Detector,
+    rng: np.random.Generator,
+) -> dict[str, NDArray[Any]]:
+    """Columns of the measured stars of a chip, from their true pixels and magnitudes."""
+    n = len(x)
+    error = centroid_error(mag)
+    if detector.cte:
+        y = y + cte_shift(chip.number, y, mag, epoch)
+    moved = detector.centroid * error * rng.standard_normal((2, n))
+
+    # a neighbour shifts the centroid in proportion to its fraction of the flux
+    blended = rng.uniform(size=n) < detector.blended
+    distance = REACH * np.sqrt(rng.uniform(size=n))
+    angle = rng.uniform(0.0, 2.0 * np.pi, n)
+    ratio = 10 ** rng.uniform(-2.0, -0.3, n)
+    pull = np.where(blended, distance * ratio / (1.0 + ratio), 0.0)
+
+    quality = error * np.exp(0.25 * rng.standard_normal(n))
+    saturated = mag < SATURATED
+    quality = np.where(saturated, 0.3 * np.exp(0.5 * rng.standard_normal(n)), quality)
+    quality = np.where(blended, quality + 0.3 * pull, quality)
+    measured_mag = mag + np.hypot(0.02, error) * rng.standard_normal(n)
+    measured_mag -= np.where(blended, 2.5 * np.log10(1.0 + ratio), 0.0)
+    return {
+        "x": x + moved[0] + pull * np.cos(angle),
+        "y": y + moved[1] + pull * np.sin(angle),
+        "chip": np.full(n, chip.number, np.int64),
+        "mag": measured_mag,
+        "q": quality,
+        "blended": blended,
+    }
+
+
+def _junk(
+    chip: Chip, stars: int, share: float, rng: np.random.Generator
+) -> dict[str, NDArray[Any]]:
+    """Columns of false detections, most of them faint and with a poor fit quality."""
+    n = int(rng.poisson(stars * share / (1.0 - share)))
+    nx, ny = chip.size
+    return {
+        "x": rng.uniform(BORDER, nx + 1 - BORDER, n),
+        "y": rng.uniform(BORDER, ny + 1 - BORDER, n),
+        "chip": np.full(n, chip.number, np.int64),
+        "mag": FAINT - rng.exponential(1.5, n),
+        "q": 0.25 * np.exp(0.8 * rng.standard_normal(n)),
+        "blended": np.zeros(n, bool),
+        "star": np.full(n, -1, np.int64),
+    }
+
+
+# -- look-up tables -------------------------------------------------------------------------------
+
+
+STEP = 64.0
+SHAPE = (32, 64)  # nodes along y and x
+ORDER = 5  # the tables are orthogonal to polynomials of this order
+FINE = 16.0  # pixels between the points for integrals over the chip
+DETECTOR_LONGEST = {1: 0.17, 2: 0.085}  # longest vector by chip, pixels
+DETECTOR_LENGTH = 200.0  # correlation length, pixels
+COLUMNS = 4096 / 60  # "every 68th column": 60 equal strips of the mask
+COLUMN_AMPLITUDE = 0.1  # relative to the longest vector
+# longest vector in pixels, from Figures 12, 13 and 11; for F814W, which is not shown, it is the
+# largest value for filters in the text
+FILTER_LONGEST = {"F435W": 0.062, "F475W": 0.08, "F606W": 0.032, "F814W": 0.05}
+FILTER_LENGTH = 150.0  # "spatially coherent over ~150 pixels", Section 4.3.2
+
+
+def _nodes() -> tuple[Float, Float]:
+    """Pixels x and y (ny nx,) of all nodes."""
+    x = (STEP + 1) / 2 + STEP * np.arange(SHAPE[1], dtype=float)
+    y = (STEP + 1) / 2 + STEP * np.arange(SHAPE[0], dtype=float)
+    return mesh(x, y)
+
+
+@lru_cache(maxsize=2)
+def _factor(length: float) -> Float:
+    """Cholesky factor of the Matern 3/2 correlation between nodes."""
+    x, y = _nodes()
+    d = np.sqrt(3.0) * np.hypot(x[:, None] - x, y[:, None] - y) / length
+    return np.asarray(cholesky((1.0 + d) * np.exp(-d), lower=True, check_finite=False))
+
+
+@lru_cache(maxsize=2)
+def _followed(chip: int) -> Float:
+    """Orthonormal basis (2 nodes, 84) of the parts of a table that polynomials can absorb.
+
+    It spans the values of polynomials at the nodes, for shifts along x and y, and the weights of
+    the nodes in the integrals over the chip of polynomials times the displacement of u and of v.
+    A fit of polynomials without tables would absorb these parts.
+    """
+    model, theta = acs_solution()
+    basis = PolynomialBasis(ORDER, CHIPS[0].size, HALF)
+    at_nodes = basis.evaluate(*_nodes())
+    n, K = at_nodes.shape
+    x, y = mesh(*(np.arange(0.5 + FINE / 2, size, FINE) for size in CHIPS[0].size))
+    by_pixel = [
+        model.predict(theta, x + dx, y + dy, epoch=EPOCH0[0], chip=chip)
+        - model.predict(theta, x - dx, y - dy, epoch=EPOCH0[0], chip=chip)
+        for dx, dy in ((0.5, 0.0), (0.0, 0.5))
+    ]
+    index, weight = LookupTable(chip, np.zeros((2, *SHAPE))).weights(x, y)
+    rows = np.repeat(np.arange(len(x)), 4)
+    node_weights = csr_array((weight.ravel(), (index.ravel(), rows)), shape=(n, len(x)))
+    values = basis.evaluate(x, y) * (FINE / STEP) ** 2
+    out = np.zeros((4, K, 2, n))
+    for along in (0, 1):
+        out[along, :, along] = at_nodes.T
+        for axis in (0, 1):
+            out[2 + axis, :, along] = (node_weights @ (values * by_pixel[along][:, [axis]])).T
+    q, _ = np.linalg.qr(out.reshape(4 * K, 2 * n).T)
+    return q
+
+
+def _without_polynomial(values: Float, chip: int) -> Float:
+    """Values (2, nodes) without the parts that polynomials can absorb, so that they are unique."""
+    q, flat = _followed(chip), values.ravel()
+    for _ in range(2):  # the second pass removes rounding errors
+        flat = flat - q @ (q.T @ flat)
+    return flat.reshape(values.shape)
+
+
+def _table(values: Float, longest: float, chip: int, filter: str = "") -> LookupTable:
+    values = _without_polynomial(values, chip)
+    values = values * (longest / np.hypot(*values).max())
+    return LookupTable(chip, values.reshape(2, *SHAPE), filter)
+
+
+def detector_tables(rng: np.random.Generator) -> tuple[LookupTable, ...]:
+    """Detector tables (irregularities of the pixel grid), one per chip.
+
+    Each is the sum of a smooth random field and, along x, a saw-tooth due to a mask that was
+    stepped over the columns.  The nodes are 64 pixels apart and sample the saw-tooth of 68 pixels
+    as a slow beat.  The tables are orthogonal to polynomials up to order 5: the sum over the nodes
+    of value times polynomial is 0, and so is a polynomial fitted to uniformly distributed stars.
+    """
+    x, _ = _nodes()
+    out = []
+    for chip in CHIPS:
+        values = (_factor(DETECTOR_LENGTH) @ rng.standard_normal((x.size, 2))).T
+        saw = 2.0 * ((x / COLUMNS + rng.uniform()) % 1.0) - 1.0
+        values[0] += COLUMN_AMPLITUDE * np.hypot(*values).max() * saw
+        out.append(_table(values, DETECTOR_LONGEST[chip.number], chip.number))
+    return tuple(out)
+
+
+def filter_tables(filter: str, rng: np.random.Generator) -> tuple[LookupTable, ...]:
+    """Filter tables, one per chip: smooth random fields that are orthogonal to polynomials."""
+    n = SHAPE[0] * SHAPE[1]
+    fields = [(_factor(FILTER_LENGTH) @ rng.standard_normal((n, 2))).T for _ in CHIPS]
+    longest = [
+        np.hypot(*_without_polynomial(field, chip.number)).max()
+        for chip, field in zip(CHIPS, fields, strict=True)
+    ]
+    return tuple(
+        _table(field, FILTER_LONGEST[filter] * length / max(longest), chip.number, filter)
+        for chip, field, length in zip(CHIPS, fields, longest, strict=True)
+    )
