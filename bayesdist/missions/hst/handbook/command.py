@@ -73,7 +73,7 @@ def handbook(
         save_figures(figures, folder)
         write_table(Table(rows), folder / "numbers.ecsv")
         record |= {"calibration": calibration.name, "detector": detector, "figures": list(figures)}
-    shown = [row | {"published": row["published"] or "-"} for row in rows]
+    shown = [{**row, "published": row["published"] or "-"} for row in rows]
     return f"{output}: {', '.join(figures)}{missing}\n{table_text(shown, 5)}"
 
 
