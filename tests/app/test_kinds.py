@@ -79,6 +79,18 @@ def test_another_artefact_drops_what_rested_on_the_former(finished, fitted):
         assert refitted.stars is results.stars
 
 
+def test_an_artefact_that_no_stage_makes_is_refused(fitted):
+    with pytest.raises(LookupError, match="fitted"):
+        fitted.having(fitted=fitted.fit)
+
+
+def test_another_configuration_keeps_the_stars(fitted):
+    """The fit of a higher order has more parameters, and the same stars."""
+    higher = fit(fitted.with_config(fitted.config.of_order(fitted.model.order + 1)))
+    assert higher.stars is fitted.stars and higher.model.order == fitted.model.order + 1
+    np.testing.assert_array_equal(higher.matches.x, fitted.matches.x)
+
+
 def test_one_law_of_errors_for_all_stars():
     table = simulated(50, mag=np.linspace(12.0, 18.0, 50))[0]
     mag = np.array([12.0, 18.0])
