@@ -17,6 +17,9 @@ from bayesdist.infer.kernel.numeric import exp_negative, whole_vectors
 from bayesdist.infer.kernel.star_modes import cholesky
 from bayesdist.utils.arrays import Float
 
+# options of functions with vectorised sums.  Their loops either add or write arrays: before a loop
+# that does both, compiled code compares the places of the arrays in memory, and adds in another
+# order where these are near each other
 SUMS = PASS | {"fastmath": FAST | {"reassoc"}}
 
 
@@ -306,6 +309,7 @@ def _share(i, u, r, inverse, P, D, seen, noise, matrix, pull, part):
         v, total = u[j], 0.0
         for e in range(n):
             part[e] = seen[e] * v[e]
+        for e in range(n):
             total += part[e] * pull[e]
         x[j] = total + D[j] ** 2 * row[j]
         for m in range(j + 1):
@@ -381,6 +385,7 @@ def _rescale(u, r, inverse, D, seen, variance, noise, matrix, pull, part):
             product = 0.0
             for e in range(n):
                 pull[e] += a[e] * z[e]
+            for e in range(n):
                 product += part[e] * a[e] * w[e]
             matrix[j, m] = product
         for e in range(n):

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from itertools import permutations
+
 import numpy as np
 import pytest
 from scipy import stats
 
 from bayesdist.infer.kernel import densities, draw_deviations, gaussians, precisions
+from bayesdist.infer.kernel.small import _rescale, _share, _stretch
 
 N_CHAINS, N_EXPOSURES = 3, 6
 
@@ -83,3 +86,28 @@ def test_gaussians_are_drawn_and_integrated(rng):
     np.testing.assert_allclose(np.cov(white), np.eye(q), atol=4.5 * np.sqrt(2 / n))
     expected = 0.5 * right @ mean - 0.5 * np.linalg.slogdet(matrix)[1]
     np.testing.assert_allclose(value, expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("n", [5, 12, 40])
+def test_moves_of_the_deviations_do_not_depend_on_where_the_arrays_are(n, rng):
+    """Vector code is left where arrays are near each other in memory, and adds in another order."""
+    k, results = 4, set()
+    values = [rng.standard_normal(shape) for shape in ((k, n), (k, n), (n,), (n,))]
+    formal, noise = batch_last(covariances(k, n, rng)), rng.standard_normal((k + 1, k))
+    luck, seen = -rng.standard_exponential(k), np.ones(n)
+    precision, scale = covariances(k, 1, rng)[0], rng.uniform(1, 2, k)
+    for order in permutations(range(4)):
+        for gap in range(0, 20, 3):
+            pool, at, placed = np.zeros(sum(v.size for v in values) + 4 * gap), 0, {}
+            for j in order:
+                placed[j] = pool[at : at + values[j].size].reshape(values[j].shape)
+                placed[j][...] = values[j]
+                at += values[j].size + gap
+            u, r, pull, part = (placed[j] for j in range(4))
+            P, D, matrix = precision.copy(), scale.copy(), np.empty((k, k))
+            for i in range(k):
+                _share(i, u, r, formal, P, D, seen, noise[i], matrix, pull, part)
+                _stretch(i, u, r, formal, P, D, seen, 5.0, noise[i, i], luck[i], pull, part)
+            _rescale(u, r, formal, D, seen, 2.0, noise[k], matrix, pull, part)
+            results.add((u.tobytes(), P.tobytes(), D.tobytes()))
+    assert len(results) == 1
