@@ -128,13 +128,13 @@ def common_chips(a: Calibration, b: Calibration) -> list[tuple[int, int]]:
 
 
 def difference_from_previous(
-    calibration: Calibration, previous: Path, epoch: float | None
+    calibration: Calibration, previous: Path, epoch: float | None, name: str | None = None
 ) -> tuple[Comparison, ...]:
     """Difference between each chip of a calibration and that of the release at `previous`.
 
     Shift, rotation and scale are fitted and removed. `epoch`, in decimal years, is used for
     calibrations that depend on time.  The filter and the size of the calibration are used if the
-    file requires them.
+    file requires them.  `name` is that of the release in the result (default: its path).
     """
     filter = calibration.filter or None if "filter" in asks_of(previous) else None
     try:
@@ -144,7 +144,7 @@ def difference_from_previous(
         released = calibration_at(previous, filter=filter, size=size)
     maps = [
         version.by_chip(epoch if version.model.time is not None else None)
-        for version in (calibration, replace(released, name=str(previous)))
+        for version in (calibration, replace(released, name=name or str(previous)))
     ]
     rng = np.random.default_rng(NOISE_SEED)
     return tuple(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import shlex
 import sys
 from pathlib import Path
 from typing import Any
@@ -104,10 +105,20 @@ def report_input(run: Run) -> ReportInput:
         flagged=diagnostics.flagged,
         tables=run.tables.tables,
         provenance={"folder": folder}
-        | {k: facts[k] for k in ("command", "created", "seed", "inputs", "versions")}
+        | {"command": _without_folders(facts["command"])}
+        | {k: facts[k] for k in ("created", "seed", "inputs", "versions")}
         | {"stages": directory.record.stages},
         **run.kind.report_parts(run),
     )
+
+
+def _without_folders(command: str) -> str:
+    """Command line without the folders of absolute paths, which run.json has."""
+    try:
+        words = shlex.split(command)
+    except ValueError:  # it was changed since it was recorded
+        return command
+    return shlex.join(Path(word).name if Path(word).is_absolute() else word for word in words)
 
 
 def _difference_from_previous(run: Run) -> tuple[Comparison, ...]:
@@ -116,7 +127,9 @@ def _difference_from_previous(run: Run) -> tuple[Comparison, ...]:
     if previous is None:
         return ()
     product = product_of_run(run)
-    return difference_from_previous(product.calibration, run.base / previous, product.options.epoch)
+    return difference_from_previous(
+        product.calibration, run.base / previous, product.options.epoch, previous
+    )
 
 
 MOST_NAMED = 3  # largest number of chips named in a title

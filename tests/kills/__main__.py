@@ -56,16 +56,14 @@ def outcomes(
     """Outcomes of strikes at a number of random moments each, spread over the stages."""
     for job in jobs:
         config = JOBS[job](folder / job / "input")
-        # all runs are made in the same place, because they name their files in full
         torn, expected = (folder / job / name / "run" for name in ("torn", "expected"))
-        torn.parent.mkdir()
+        expected.parent.mkdir()
         if real:
-            process = RunProcess(config, torn, real=True)
+            process = RunProcess(config, expected, real=True)
             assert process.wait() == 0, process.errors
         else:  # forks of this process need not load again what it has loaded
             with quick(), _copied_at_each_stage(folder / job):
-                good("run", config, "-o", torn, "-q")
-        shutil.move(torn.parent, expected.parent)
+                good("run", config, "-o", expected, "-q")
         for strike in strikes:
             rng = random.Random(f"{seed} {job} {strike}")
             outcome = Outcome(job, strike)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -73,6 +75,7 @@ def match_lists(run: Run) -> Run:
         # roll angles of the matches, because the log need not have them
         *shear_warnings(np.asarray(table["rotation"]), "of the matches"),
     ]
+    warnings = [_named_from(inputs.base, text) for text in warnings]
     pairs = neutralise_aberration(matches.table, inputs.log)
     facts = _facts(matches, table, inputs, warnings)
     run = with_pairs(run, pairs, facts, table)
@@ -105,7 +108,7 @@ def _facts(
         "n_pairs": len(found.table),
         "n_catalog": len(inputs.whole_catalog),
         "n_catalog_used": len(inputs.catalog),
-        "left_out": dict(found.left_out),
+        "left_out": {k: _named_from(inputs.base, v) for k, v in found.left_out.items()},
         "completeness": {
             "median": float(np.median(table["completeness"])),
             "least": float(np.min(table["completeness"])),
@@ -116,6 +119,11 @@ def _facts(
         "radius": [float(table["radius_min"].min()), float(table["radius_max"].max())],
         "warnings": warnings,
     }
+
+
+def _named_from(base: Path, text: str) -> str:
+    """Text of a result in which files are named relative to the folder of the configuration."""
+    return text.replace(f"{base}{os.sep}", "") if base.is_absolute() else text
 
 
 def _log(facts: Mapping[str, Any], n_detected: int) -> None:
