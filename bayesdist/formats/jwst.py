@@ -16,6 +16,7 @@ from bayesdist.products.common.asdf.tree import (
 )
 from bayesdist.products.common.content import Content
 from bayesdist.products.common.document import Finding
+from bayesdist.products.common.rules import missing_entries
 
 
 class Settings(PlacedSettings):
@@ -118,14 +119,12 @@ def _meta(detector: str, settings: Settings) -> ReferenceMeta:
 def lint_meta(meta: Mapping[str, Any]) -> Iterator[Finding]:
     """Findings on the metadata that identify a file."""
     instrument = meta["instrument"]
-    missing = [f"meta.{key}" for key in _REQUIRED if not meta.get(key)]
-    missing += [f"meta.instrument.{key}" for key in ("name", "detector") if not instrument.get(key)]
-    if instrument.get("name") == "NIRCAM":
-        missing += [f"meta.instrument.{key}" for key in _NIRCAM if not instrument.get(key)]
-    if missing:
-        yield Finding(
-            "warning", ", ".join(missing), "not there, and JWST's DistortionModel asks for it"
-        )
+    yield from missing_entries(
+        meta,
+        _REQUIRED,
+        ("name", "detector", *(_NIRCAM if instrument.get("name") == "NIRCAM" else ())),
+        "not there, and JWST's DistortionModel asks for it",
+    )
     if not meta.get("exposure", {}).get("type"):
         yield Finding("note", "meta.exposure.type", "is missing; files are chosen by it")
     reftype = str(meta.get("reftype", ""))

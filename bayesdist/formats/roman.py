@@ -17,6 +17,7 @@ from bayesdist.products.common.asdf.tree import (
 )
 from bayesdist.products.common.content import Content
 from bayesdist.products.common.document import Finding
+from bayesdist.products.common.rules import missing_entries, other_type
 
 if TYPE_CHECKING:
     from astropy.time import Time
@@ -97,21 +98,13 @@ def _time(text: str) -> Time:
 
 def lint_meta(meta: Mapping[str, Any]) -> Iterator[Finding]:
     """Findings on the metadata that identify a file."""
-    instrument = meta["instrument"]
-    missing = [f"meta.{key}" for key in _REQUIRED if not meta.get(key)]
-    missing += [
-        f"meta.instrument.{key}"
-        for key in ("name", "detector", "optical_element")
-        if not instrument.get(key)
-    ]
-    if missing:
-        yield Finding(
-            "warning", ", ".join(missing), "not there, and the schema of Roman's data models asks "
-            "for it",
-        )  # fmt: skip
-    reftype = str(meta.get("reftype", ""))
-    if reftype and reftype != "DISTORTION":
-        yield Finding("error", "meta.reftype", f"is {reftype!r}, and not 'DISTORTION'")
+    yield from missing_entries(
+        meta,
+        _REQUIRED,
+        ("name", "detector", "optical_element"),
+        "not there, and the schema of Roman's data models asks for it",
+    )
+    yield from other_type(str(meta.get("reftype", "")), "DISTORTION", "meta.reftype")
 
 
 FORMAT = Observatory[Settings](

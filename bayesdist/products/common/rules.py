@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -60,6 +61,23 @@ NO_SIZE = Finding("note", "NAXIS1", "the size of the image is not stated")
 def missing(present: Container[str], rules: Iterable[Missing]) -> list[Finding]:
     """Findings on keywords that are not among those that are present."""
     return [rule.finding for rule in rules if rule.keyword not in present]
+
+
+def missing_entries(
+    meta: Mapping[str, Any], names: Iterable[str], instrument_names: Iterable[str], message: str
+) -> list[Finding]:
+    """Warning about empty or missing entries of the node `meta` and of its node `instrument`."""
+    instrument = meta["instrument"]
+    paths = [f"meta.{name}" for name in names if not meta.get(name)]
+    paths += [f"meta.instrument.{name}" for name in instrument_names if not instrument.get(name)]
+    return [Finding("warning", ", ".join(paths), message)] if paths else []
+
+
+def other_type(stated: str, wanted: str, where: str) -> list[Finding]:
+    """Error if a file states another type of reference file than `wanted`."""
+    if not stated or stated == wanted:
+        return []
+    return [Finding("error", where, f"is {stated!r}, and not {wanted!r}")]
 
 
 def not_finite(values: Float, where: str, message: str) -> list[Finding]:

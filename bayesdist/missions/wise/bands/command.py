@@ -80,7 +80,7 @@ def bands_of_runs(
             provenance={"command": command, **record["versions"]},
         )
         files = [*write_tables(inputs, folder), *_meta(bands, folder), *_page(inputs, folder)]
-        record |= record_of(inputs) | {"files": files}
+        record |= {**record_of(inputs), "files": files}
     return _text(Path(output), inputs)
 
 

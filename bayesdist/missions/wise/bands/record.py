@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TypedDict
 
 import numpy as np
 from astropy.table import Table
@@ -17,7 +18,19 @@ from bayesdist.missions.wise.bands.context import BandResult, BandsInput
 from bayesdist.missions.wise.bands.findings import verdict
 
 
-def record_of(inputs: BandsInput) -> dict[str, Any]:
+class BandsRecord(TypedDict):
+    """Content of bands.json, apart from the command and versions."""
+
+    converged: bool
+    verdict: Mapping[str, str]  # level and headline
+    n_bins: int
+    optical: str | None
+    bands: list[Mapping[str, object]]  # in the order of the tables
+    differences: list[Mapping[str, object]]  # of later bands minus the first
+    tables: Mapping[str, Mapping[str, object]]  # unit and rows, by table
+
+
+def record_of(inputs: BandsInput) -> BandsRecord:
     """Content of bands.json, apart from the command and versions."""
     result = verdict(inputs)
     return {
@@ -46,7 +59,7 @@ def record_of(inputs: BandsInput) -> dict[str, Any]:
     }
 
 
-def _band(b: BandResult) -> dict[str, Any]:
+def _band(b: BandResult) -> Mapping[str, object]:
     c, p = b.correlation, b.partition
     count = b.sums.bins.count
     return {
@@ -105,7 +118,7 @@ def _band(b: BandResult) -> dict[str, Any]:
     }
 
 
-def _histogram(h: ResidualHistogram) -> dict[str, Any]:
+def _histogram(h: ResidualHistogram) -> Mapping[str, object]:
     return {
         "unit": "pix",
         "reach": h.reach,
@@ -119,9 +132,9 @@ def _histogram(h: ResidualHistogram) -> dict[str, Any]:
     }
 
 
-def _row(one: RowAccount) -> dict[str, Any]:
+def _row(one: RowAccount) -> Mapping[str, object]:
     row = one.row
-    out: dict[str, Any] = {
+    out: dict[str, object] = {
         "label": row.label,
         "value": row.value,
         "error": row.error,
