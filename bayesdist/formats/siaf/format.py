@@ -124,7 +124,7 @@ def _files(
     head.append(f"Idl2Sci of Sci2Idl misses a pixel by {closure:.2g} pixels at worst.")
     record = record_of(dated, calibration, epoch=date, closure=closure)
     record["provenance"]["detector"] = aperture
-    values = {SIDE: 1, "table": name} | _covariance(poly) | {"bayesdist": record}
+    values = {SIDE: 1, "table": name, **_covariance(poly), "bayesdist": record}
     text = json.dumps(_listed(values), indent=1, allow_nan=False) + "\n"
     return (
         Built(side, PARAMETERS, text.encode("ascii"), record),
@@ -169,10 +169,10 @@ def _joined(head: Sequence[str], lines: Sequence[str]) -> bytes:
     return ("\n".join([*plain, "#", *lines]) + "\n").encode("ascii")
 
 
-def _covariance(poly: Monomials) -> dict[str, Any]:
+def _covariance(poly: Monomials) -> dict[str, list[str] | Float]:
     """Coefficients of Sci2Idl with sigmas and covariance, u before v, under their SIAF names."""
     names = [f"Sci2Idl{axis}{i + j}{j}" for axis in "XY" for i, j in poly.terms]
-    out: dict[str, Any] = {"names": names, "values": poly.values.ravel()}
+    out: dict[str, list[str] | Float] = {"names": names, "values": poly.values.ravel()}
     if poly.cov is not None:
         out["sigma"] = np.sqrt(np.maximum(np.diag(poly.cov), 0.0))
         out["covariance"] = poly.cov

@@ -15,10 +15,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.data.matches import Matches
-from bayesdist.data.storage import Part, write_parts
+from bayesdist.data.storage import Labelled, Part, write_parts
 from bayesdist.data.tables.checks import columns_of
 from bayesdist.errors import InputError
 from bayesdist.files.atomic import made_folder
@@ -181,7 +181,7 @@ def write_rvb(batches: Iterable[RvbPairs], folder: str | os.PathLike[str]) -> in
     return sum(sizes)
 
 
-def _columns(pairs: RvbPairs) -> dict[str, Any]:
+def _columns(pairs: RvbPairs) -> dict[str, NDArray[Any] | Labelled]:
     m = pairs.matches
     columns = columns_of(m, _NUMBERS) | columns_of(pairs, ["colour"]) | columns_of(m, ["star"])
     if m.exposure_names != ("1",):  # the pairs have frames

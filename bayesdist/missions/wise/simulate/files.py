@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 from astropy.table import Table
+from numpy.typing import NDArray
 
-from bayesdist.data.storage import write_columns
+from bayesdist.data.storage import Labelled, write_columns
 from bayesdist.errors import InputError
 from bayesdist.files.atomic import atomic_path, made_folder
 from bayesdist.missions.wise.simulate.pattern import PartitionPattern
@@ -107,7 +108,7 @@ def _written(
             job.cancel()
 
 
-def _columns(one: WiseSet, chunk: PairChunk) -> dict[str, Any]:
+def _columns(one: WiseSet, chunk: PairChunk) -> dict[str, NDArray[Any] | Labelled]:
     first, last = int(chunk.frame[0]), int(chunk.frame[-1])
     names = one.survey.names[first : last + 1]
     return {
