@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Annotated, Literal
 
 import numpy as np
@@ -28,7 +28,7 @@ from bayesdist.formats.sip.header import (
     inverse_is_used,
     worst_closure,
 )
-from bayesdist.formats.sip.lint import Explanation, lint_sip
+from bayesdist.formats.sip.lint import lint_sip
 from bayesdist.plugin import mission_objects
 from bayesdist.products.common.cards import header_of
 from bayesdist.products.common.coefficients import sip_keyword
@@ -62,12 +62,13 @@ def _parse(content: Content) -> Content | None:
 
 
 def _lint(content: Content) -> tuple[Finding, ...]:
-    return lint_sip(sip_of(content), explain=_explanation())
+    return lint_sip(sip_of(content), explain=_explain)
 
 
-def _explanation() -> Explanation | None:
-    """Check by a mission that names a wrong coefficient; None if no mission provides it."""
-    return mission_objects(lambda mission: mission.checks, only="sip").get("sip")
+def _explain(sip: SipHeader, size: tuple[int, int], closure: float) -> Iterable[Finding]:
+    """Findings of the check that a mission provides for `lint_sip`; none without such a mission."""
+    check = mission_objects(lambda mission: mission.checks, only="sip").get("sip")
+    return () if check is None else check(sip, size, closure)
 
 
 def _calibration(content: Content, name: str, choice: Choice) -> Calibration:
@@ -193,7 +194,7 @@ def describe_sip(content: Content, extra: Sequence[Finding] = ()) -> list[str]:
         if "A_ORDER" not in header:
             return None
         sip = parsed(header, name)
-        findings = [*lint_sip(sip, explain=_explanation()), *_left_over(header)]
+        findings = [*lint_sip(sip, explain=_explain), *_left_over(header)]
         return DistortionText(sip_lines(sip, name), coefficient_lines(sip), findings)
 
     return describe_wcs(content, extra, distortion)
