@@ -11,7 +11,7 @@ from astropy.io import fits
 from bayesdist.formats.idctab.lint import lint_idctab
 from bayesdist.formats.idctab.table import IdcTab, read_idctab
 from bayesdist.formats.sip.build import sip_from_solution
-from bayesdist.formats.sip.header import SipHeader
+from bayesdist.formats.sip.header import SipHeader, worst_closure
 from bayesdist.formats.sip.lint import lint_sip
 from bayesdist.products import describe
 from bayesdist.products.common.cards import number_card
@@ -100,6 +100,21 @@ def test_a_size_can_be_told() -> None:
     sip = replace(good(), size=None)
     assert [finding.where for finding in lint_sip(sip, (1200, 900))] == ["AE, BE"]
     assert "A_DMAX: says" in said(lint_sip(sip, (600, 450)))
+
+
+def test_no_coefficient_is_blamed_if_the_polynomials_overflow() -> None:
+    """The closure is then not a number, for which no value of a coefficient can be solved."""
+
+    def explain(*_):
+        raise AssertionError("the closure is unknown")
+
+    sip = good()
+    high = {(4, 0): 1e308, (3, 1): -1e308}
+    with np.errstate(all="ignore"):
+        wrong = replace(sip, a={**sip.a, **high}, order=(4, 4))
+        assert np.isnan(worst_closure(wrong, sip.size))
+        found = lint_sip(wrong, explain=explain)
+    assert not [f for f in found if f.where == "AP, BP"]
 
 
 # -- IDCTAB --------------------------------------------------------------------------------------

@@ -190,6 +190,8 @@ def _inverse(
     if not inverse_is_used(sip):
         return
     closure = worst_closure(sip, size)
+    if np.isnan(closure):  # the polynomials overflow: no calibration can be made of the header
+        return
     advice = "raise AP_ORDER" if max(sip.inverse_order) < SIP_ORDERS[1] else "better iterate"
     yield from replace(_INVERSE, poor=_INVERSE.poor + advice).findings(
         closure,
