@@ -18,8 +18,8 @@ from bayesdist.errors import FormatError, InputError
 from bayesdist.formats.sip.files import write_sip
 from bayesdist.formats.sip.header import worst_closure
 from bayesdist.formats.sip.lint import lint_sip
+from bayesdist.missions.wise.meta_data.format import lint_wise_band
 from bayesdist.missions.wise.meta_data.implied import implied_values, wrong_coefficient
-from bayesdist.missions.wise.meta_data.lint import lint_wise_band
 from bayesdist.missions.wise.meta_data.meta import read_wise_meta
 from bayesdist.products import describe, lint
 from bayesdist.products.common.coefficients import evaluate, largest_magnitude
