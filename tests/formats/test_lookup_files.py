@@ -19,6 +19,7 @@ from bayesdist.formats.lookup.format import lint_lookup_file
 from bayesdist.formats.lookup.npol import read_npol, write_npol
 from bayesdist.model.lookup import LookupTable
 from bayesdist.products import describe
+from bayesdist.products.common.content import read_content
 
 from .support import F606W, some_solution, wfc_solution
 
@@ -431,3 +432,13 @@ def test_our_own_file_shows_its_sigmas(good) -> None:
         for sigma in file.sigma(chip):
             assert f"{np.median(sigma):.4f}" in text
     assert ("error of the linear form" in text) == (good.stem == "npol")
+
+
+def test_compressed_tables_are_named(tmp_path):
+    path = tmp_path / "a.fits"
+    tables = [fits.CompImageHDU(np.zeros((32, 64), np.float32), name=name) for name in ("DX", "DY")]
+    fits.HDUList([fits.PrimaryHDU(), *tables]).writeto(path)
+    with pytest.raises(FormatError, match=r"a\.fits: extension DX,1 is a compressed image"):
+        read_lookup_file(path)
+    with pytest.raises(FormatError, match="extension DY,1 is a compressed image"):
+        read_content(path).hdus[2].image  # noqa: B018

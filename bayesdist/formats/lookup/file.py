@@ -49,7 +49,7 @@ class LookupFile:
     Raises
     ------
     FormatError
-        If there is no image extension DX or DY.
+        If there is no image extension DX or DY, or if these are compressed images.
     """
 
     hdus: tuple[Hdu, ...]  # all HDUs
@@ -57,6 +57,8 @@ class LookupFile:
 
     def __post_init__(self) -> None:
         if not self.planes:
+            for hdu in self.hdus:
+                hdu.refuse_compressed(self.name)
             raise FormatError(
                 "has no image extension DX or DY",
                 where=self.name,

@@ -105,9 +105,19 @@ class Hdu:
         out.flags.writeable = False
         return out
 
+    def refuse_compressed(self, where: str = "") -> None:
+        """Raise FormatError for an image that is stored as a table of compressed tiles."""
+        if "ZIMAGE" in self.header:
+            raise FormatError(
+                f"extension {self.label or 'without a name'} is a compressed image",
+                where=where,
+                do="decompress the file first, for instance with funpack",
+            )
+
     @cached_property
     def image(self) -> Float:
-        """Pixels (ny, nx) of an image extension."""
+        """Pixels (ny, nx) of an image extension; FormatError if they are compressed in a table."""
+        self.refuse_compressed()
         return np.asarray(fits.ImageHDU.fromstring(self.to_bytes()).data, float)
 
 
