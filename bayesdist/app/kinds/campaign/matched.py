@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -92,6 +92,8 @@ def load_matched_campaign(run: Run) -> Run:
     """Run with the matches of an earlier stage, from its folder."""
     inputs: Inputs = run.inputs
     pairs = read_matches(run.directory / PAIRS, unit=inputs.catalog.unit)
+    # stored with the diagnostics, which do not say in which folder the run is
+    pairs = replace(pairs, sources=tuple(f"{PAIRS}/{Path(name).name}" for name in pairs.sources))
     return with_pairs(run, pairs, run.directory.summary.get("matching", {}))
 
 
