@@ -235,7 +235,7 @@ def _columns_of(file: StoredFile) -> set[str]:
         available.add("epoch")
     if _has_errors(file):
         available |= set(SIGMAS)
-    if "sigma_ra" in file.found and CORRELATIONS & set(file.found):
+    if "sigma_x" in file.found or ("sigma_ra" in file.found and CORRELATIONS & set(file.found)):
         available.add(CORRELATION)
     for on_sky, on_plane in (("pm_ra", "pm"), ("sigma_pm_ra", "sigma_pm")):
         if on_sky in file.found:
@@ -265,8 +265,8 @@ def _refuse_differences(parts: Sequence[StoredFile]) -> None:
 
 
 def _has_errors(file: StoredFile) -> bool:
-    """True if a file has errors of the matches, or of the reference positions."""
-    return bool({"sigma_u", "sigma_ra"} & set(file.found))
+    """True if a file has errors of the matches, the reference positions or the centroids."""
+    return bool({"sigma_u", "sigma_ra", "sigma_x"} & set(file.found))
 
 
 @dataclass(frozen=True, eq=False)

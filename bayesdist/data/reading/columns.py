@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from bayesdist.data.reading.centroids import with_centroid_errors
 from bayesdist.data.reading.options import ReadOptions
 from bayesdist.data.sky import SKY_QUANTITIES, onto_plane, reference_sky
 from bayesdist.data.tables.checks import refuse_half
@@ -17,11 +18,7 @@ from bayesdist.data.tables.names import ALIASES, PAIRS, find_columns, origin_of
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Float, Int
 
-# names that photutils and other programs use for errors of x and y in pixels
-CENTROID_ERRORS = (
-    *(("x_err", "y_err"), ("xerr", "yerr"), ("x_error", "y_error"), ("sigma_x", "sigma_y")),
-    *(("e_x", "e_y"), ("xcentroid_err", "ycentroid_err"), ("x_fit_err", "y_fit_err")),
-)
+CENTROIDS = ("sigma_x", "sigma_y", "rho_xy")  # errors of the centroids, in pixels
 
 
 def position_unit(pair: tuple[SourceColumn, SourceColumn], unit: str | None) -> str:
@@ -105,7 +102,7 @@ def present_columns(
     if not read_sigma:
         unread |= {"sigma_u", "sigma_v", "rho_uv"}
     if not read_sigma or "sigma_u" in present:  # errors of the match include those of the catalogue
-        unread |= {"sigma_ra", "sigma_dec"}
+        unread |= {"sigma_ra", "sigma_dec", *CENTROIDS}
     if "mag" in present:
         unread.add("flux")
     return {key: name for key, name in present.items() if key not in unread}
@@ -160,26 +157,13 @@ def columns_read(
     """
     needed = needed_columns(names, options.columns, source=source, read_sigma=options.read_sigma)
     _refuse_unused(options, needed, source)
-    notes = _unused_centroid_errors(names, needed) if options.read_sigma else ()
+    notes: tuple[str, ...] = ()
     if options.pixel_origin is not None:
         return needed, options, notes
     origin, why = origin_of(needed["x"], names, header)
     if why:
         notes = (f"the first pixel is taken as {origin}: {why}", *notes)
     return needed, replace(options, pixel_origin=origin), notes
-
-
-def _unused_centroid_errors(names: Sequence[str], found: Mapping[str, str]) -> tuple[str, ...]:
-    """Note on columns with errors of x and y, if the table has no errors of the matches."""
-    lower = {name.lower(): name for name in names}
-    pair = next((pair for pair in CENTROID_ERRORS if lower.keys() >= set(pair)), None)
-    if pair is None or "sigma_u" in found:
-        return ()
-    x, y = (lower[name] for name in pair)
-    return (
-        f"{x} and {y} are errors of the centroids in pixels and are not used: write the errors of "
-        "the matches, in the unit of u and v, to columns sigma_u and sigma_v",
-    )
 
 
 def _refuse_unused(options: ReadOptions, found: Mapping[str, str], source: str) -> None:
@@ -259,7 +243,7 @@ def match_columns(quantities: Quantities, options: ReadOptions) -> dict[str, Any
         out["chip"], out["chip_numbers"], out["chip_names"] = numbered_chips(
             column("chip"), options.chips
         )
-    return out
+    return out | with_centroid_errors(quantities, out)
 
 
 def _pixels(column: SourceColumn, pixel_origin: int | None) -> Float:

@@ -50,6 +50,17 @@ ALIASES: dict[str, tuple[str, ...]] = {
     ),
     "sigma_u": (*BASIC["sigma_u"], "xi_error", "xi_err", "sigma_xi", "e_xi"),
     "sigma_v": (*BASIC["sigma_v"], "eta_error", "eta_err", "sigma_eta", "e_eta"),
+    "sigma_x": (
+        *("sigma_x", "x_err", "xerr", "x_error", "e_x", "xcentroid_err", "x_centroid_err"),
+        *("x_fit_err", "x_psf_err", "x_centroid_win_err", "slot_centroid_xerr"),
+        *("errx2win_image", "errx2psf_image", "errx2_image"),
+    ),
+    "sigma_y": (
+        *("sigma_y", "y_err", "yerr", "y_error", "e_y", "ycentroid_err", "y_centroid_err"),
+        *("y_fit_err", "y_psf_err", "y_centroid_win_err", "slot_centroid_yerr"),
+        *("erry2win_image", "erry2psf_image", "erry2_image"),
+    ),
+    "rho_xy": ("rho_xy", "corr_xy", "errxywin_image", "errxypsf_image", "errxy_image"),
     "rho_uv": ("rho_uv", "corr_uv", "uv_corr"),
     "sigma_ra": ("ra_error", "e_ra_icrs", "sigra"),
     "sigma_dec": ("dec_error", "e_de_icrs", "sigdec"),
@@ -95,7 +106,7 @@ ALIASES: dict[str, tuple[str, ...]] = {
 
 PAIRS = (
     *(("x", "y"), ("u", "v"), ("ra", "dec"), ("sigma_u", "sigma_v"), ("sigma_ra", "sigma_dec")),
-    *(("pm_ra", "pm_dec"), ("sigma_pm_ra", "sigma_pm_dec")),
+    *(("pm_ra", "pm_dec"), ("sigma_pm_ra", "sigma_pm_dec"), ("sigma_x", "sigma_y")),
 )
 
 _MAS, _MOTION = "mas", "mas / yr"

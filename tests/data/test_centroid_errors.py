@@ -1,0 +1,136 @@
+"""Errors of centroids in pixels become errors of matches."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from astropy.table import Table
+
+from bayesdist.data import ReadOptions, open_matches
+from bayesdist.errors import InputError
+from tests.data.tables import matches_from_table
+
+N, SCALE, ANGLE = 400, 0.05, 0.6  # arcsec in a pixel, radians
+R = np.array([[np.cos(ANGLE), -np.sin(ANGLE)], [np.sin(ANGLE), np.cos(ANGLE)]])
+
+
+def stars(rng, *, distorted: float = 0.0, **columns) -> Table:
+    """Stars of a turned camera, one in twenty of which is a false match."""
+    x, y = rng.uniform(1, 2000, (2, N))
+    u, v = SCALE * R @ camera(x, y, distorted)
+    wrong = rng.uniform(size=N) < 0.05
+    u, v = (z + wrong * rng.normal(0, 0.5, N) for z in (u, v))
+    return Table({"x": x, "y": y, "u": u, "v": v, **columns})
+
+
+def camera(x, y, distorted):
+    X, Y = (x - 1000) / 1000, (y - 1000) / 1000
+    return np.stack([x + distorted * X**2 * Y, y - distorted * X * Y**2])
+
+
+def covariances(matches) -> np.ndarray:
+    mixed = matches.rho_uv * matches.sigma_u * matches.sigma_v
+    rows = [[matches.sigma_u**2, mixed], [mixed, matches.sigma_v**2]]
+    return np.moveaxis(np.array(rows), -1, 0)
+
+
+def pixel_covariances(table) -> np.ndarray:
+    mixed = table["rho_xy"] * table["x_err"] * table["y_err"]
+    rows = [[table["x_err"] ** 2, mixed], [mixed, table["y_err"] ** 2]]
+    return np.moveaxis(np.array(rows), -1, 0)
+
+
+def test_the_covariance_is_turned_and_scaled_and_added_to_that_of_the_catalogue(rng):
+    errors = {"x_err": rng.uniform(0.01, 0.1, N), "y_err": rng.uniform(0.01, 0.1, N)}
+    table = stars(rng, rho_xy=rng.uniform(-0.9, 0.9, N), **errors)
+    expected = SCALE**2 * R @ pixel_covariances(table) @ R.T
+    found = matches_from_table(table, ReadOptions(unit="arcsec"))
+    np.testing.assert_allclose(covariances(found), expected, rtol=1e-3, atol=1e-9)
+    assert any("converted from pixels" in note for note in found.notes)
+    # those of the whole match leave nothing to be added
+    table["sigma_u"] = table["sigma_v"] = 0.002
+    assert (matches_from_table(table, ReadOptions(unit="arcsec")).sigma_u == 0.002).all()
+
+
+def test_catalogue_errors_on_the_sky_are_added(rng):
+    table = stars(rng, x_err=np.full(N, 0.02), y_err=np.full(N, 0.04))
+    point = (150.0, 2.0)
+    table["ra"] = point[0] + table["u"] / 3600 / np.cos(np.radians(point[1]))
+    table["dec"] = point[1] + table["v"] / 3600
+    table["ra_error"], table["dec_error"], table["ra_dec_corr"] = 1.0, 2.0, 0.5
+    for name in ("ra_error", "dec_error"):
+        table[name].unit = "mas"
+    table.remove_columns(["u", "v"])
+    found = matches_from_table(table, ReadOptions(tangent_point=point))
+    own = SCALE**2 * R @ np.diag([0.02**2, 0.04**2]) @ R.T
+    catalogue = 1e-6 * np.array([[1.0, 1.0], [1.0, 4.0]])
+    np.testing.assert_allclose(covariances(found), np.tile(own + catalogue, (N, 1, 1)), rtol=2e-3)
+
+
+def test_the_scale_is_that_at_the_star(rng):
+    """A distortion that changes the scale by some percent from the middle to the corners."""
+    table = stars(rng, distorted=60.0, x_err=np.full(N, 0.02), y_err=np.full(N, 0.02))
+    found = matches_from_table(table, ReadOptions(unit="arcsec"))
+    step = 0.5
+    x, y = np.asarray(table["x"]), np.asarray(table["y"])
+    by_x = (camera(x + step, y, 60.0) - camera(x - step, y, 60.0)) / (2 * step)
+    by_y = (camera(x, y + step, 60.0) - camera(x, y - step, 60.0)) / (2 * step)
+    J = np.moveaxis(np.stack([by_x, by_y], axis=1), -1, 0)
+    J = SCALE * R @ J
+    expected = 0.02**2 * J @ np.swapaxes(J, 1, 2)
+    assert np.ptp(expected[:, 0, 0]) > 0.1 * expected[:, 0, 0].mean()
+    np.testing.assert_allclose(found.sigma_u, np.sqrt(expected[:, 0, 0]), rtol=0.05)
+
+
+def test_exposures_that_are_turned_have_their_own_axes(rng):
+    table = stars(rng, x_err=np.full(N, 0.01), y_err=np.full(N, 0.05))
+    second = np.arange(N) % 2 == 1
+    u, v = np.asarray(table["u"]), np.asarray(table["v"])
+    table["u"], table["v"] = np.where(second, -v, u), np.where(second, u, v)
+    table["exposure"] = np.where(second, "b", "a")
+    found = covariances(matches_from_table(table, ReadOptions(unit="arcsec")))
+    np.testing.assert_allclose(found[1, 0, 0], found[0, 1, 1], rtol=1e-3)
+    np.testing.assert_allclose(found[1, 0, 1], -found[0, 0, 1], rtol=1e-3)
+
+
+def test_sextractor_has_variances_and_a_covariance(rng):
+    table = stars(rng)
+    table["ERRX2WIN_IMAGE"], table["ERRY2WIN_IMAGE"] = 0.02**2, 0.03**2
+    table["ERRXYWIN_IMAGE"] = 0.6 * 0.02 * 0.03
+    found = matches_from_table(table, ReadOptions(unit="arcsec"))
+    C = np.array([[0.0004, 0.00036], [0.00036, 0.0009]])
+    np.testing.assert_allclose(
+        covariances(found), np.tile(SCALE**2 * R @ C @ R.T, (N, 1, 1)), rtol=2e-3
+    )
+
+
+def test_stars_on_disk_have_the_same_errors(rng, tmp_path):
+    table = stars(rng, x_err=np.full(N, 0.02), y_err=np.full(N, 0.04))
+    table.write(tmp_path / "stars.parquet")
+    stored = open_matches(tmp_path / "stars.parquet", unit="arcsec").load()
+    here = matches_from_table(table, ReadOptions(unit="arcsec"))
+    for name in ("sigma_u", "sigma_v", "rho_uv"):
+        np.testing.assert_allclose(getattr(stored, name), getattr(here, name), rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("column", "values", "words"),
+    [
+        ("x_err", 0.0, "error of a pixel coordinate is 0"),
+        ("y_err", -0.1, "error of a pixel coordinate is -0.1"),
+        ("rho_xy", 1.0, "impossible beside the errors"),
+    ],
+)
+def test_impossible_errors_are_refused_with_row_and_column(rng, column, values, words):
+    table = stars(rng, x_err=np.full(N, 0.02), y_err=np.full(N, 0.02), rho_xy=np.zeros(N))
+    table[column][4] = values
+    with pytest.raises(InputError, match=words) as refused:
+        matches_from_table(table, ReadOptions(unit="arcsec"))
+    assert "row 5" in str(refused.value) and column in str(refused.value)
+
+
+def test_errors_in_another_unit_are_refused(rng):
+    table = stars(rng, x_err=np.full(N, 0.02), y_err=np.full(N, 0.02))
+    table["x_err"].unit = "arcsec"
+    with pytest.raises(InputError, match="errors of pixels are in pix"):
+        matches_from_table(table, ReadOptions(unit="arcsec"))
