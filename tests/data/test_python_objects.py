@@ -173,12 +173,17 @@ def test_errors_have_units():
 
 
 def test_errors_of_centroids_are_named():
-    """They are no errors of matches, and are not passed over in silence."""
-    table = {"x": [1.0, 2.0], "y": [1.0, 2.0], "u": [1.0, 2.0], "v": [1.0, 2.0], "mag": [9.0, 9.0]}
-    errors = {"x_err": [0.1, 0.1], "y_err": [0.1, 0.1]}
+    """They become errors of the matches, unless the table has these."""
+    at = np.array([[1.0, 2.0, 5.0, 9.0, 4.0], [1.0, 7.0, 2.0, 3.0, 8.0]])
+    table = dict(zip("xyuv", [*at, *(2 * at)], strict=True)) | {"mag": np.full(5, 9.0)}
+    errors = {"x_err": np.full(5, 0.1), "y_err": np.full(5, 0.1)}
     given = match_arguments(table | errors, ReadOptions(**UNIT))
-    assert [note for note in given["notes"] if note.startswith("x_err and y_err are errors of")]
-    known = {"sigma_u": [0.1, 0.1], "sigma_v": [0.1, 0.1]}
+    assert [note for note in given["notes"] if "errors of the centroids were converted" in note]
+    np.testing.assert_allclose(given["sigma_u"], 0.2)
+    few = {name: values[:3] for name, values in (table | errors).items()}
+    with pytest.raises(InputError, match="3 matches do not determine the size of a pixel"):
+        match_arguments(few, ReadOptions(**UNIT))
+    known = {"sigma_u": np.full(5, 0.1), "sigma_v": np.full(5, 0.1)}
     for other in (table, table | errors | known):
         notes = match_arguments(other, ReadOptions(**UNIT)).get("notes", ())
         assert not [note for note in notes if "centroids" in note]

@@ -15,9 +15,11 @@ import numpy as np
 
 from bayesdist.data.magnitude_errors import MAD_TO_SIGMA
 from bayesdist.data.tables.column import Quantities, SourceColumn
+from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Float, Int
 
 VARIANCES = ("errx2", "erry2", "errxy")  # beginnings of SExtractor's names of variances
+MIN_MATCHES = 4
 MIN_ROWS = 30  # of a chip and exposure with a Jacobian of its own
 FARTHEST = 5.0  # robust standard deviations beyond which matches are left out
 
@@ -41,10 +43,18 @@ def with_centroid_errors(quantities: Quantities, columns: Mapping[str, Any]) -> 
     Raises
     ------
     InputError
-        If errors are not positive or not in pixels, or if a correlation is impossible.
+        If errors are not positive or not in pixels, if a correlation is impossible, or if there are
+        too few matches to determine the size of a pixel.
     """
     if "sigma_x" not in quantities:
         return {}
+    if len(columns["x"]) < MIN_MATCHES:
+        raise InputError(
+            f"{len(columns['x'])} matches do not determine the size of a pixel, by which errors of "
+            "x and y become errors of u and v",
+            where=quantities.source,
+            do="give sigma_u and sigma_v",
+        )
     C = _covariances(quantities)
     J = _jacobians(columns)
     total = J @ C @ np.swapaxes(J, 1, 2)
