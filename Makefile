@@ -2,7 +2,7 @@
 #   make demo    the environment, then `bayesdist demo`
 #   make test    the environment with the test extra, checks of the code and the tests: some ten
 #                minutes on two cores
-#   make core    tests of the core while all file formats and missions are hidden
+#   make core    tests of the core while all kinds, file formats and missions are hidden
 #   make types   mypy, in an environment of its own whose versions are exact (.ci/types.txt): what a
 #                new release of numpy or mypy thinks of the code fails nobody's `make test`
 #   make ci      `make test` and `make types` at once, as .ci/run does
@@ -56,9 +56,9 @@ imports: $(VENV)/.installed-test
 suite: $(VENV)/.installed-test
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
-# The core works without formats and missions. These rooms take half a minute; all of them are
+# The core works without kinds, formats and missions. These take half a minute; all rooms are
 #   make core CORE="utils files model data products calibration simulate infer diagnose assess"
-CORE = utils model products
+CORE = test_core.py utils model products
 core: $(VENV)/.installed-test
 	BAYESDIST_PLUGINS= $(BIN)/python -m pytest -q $(addprefix tests/,$(CORE))
 

@@ -69,11 +69,15 @@ class Plugin:
         `bayesdist.products.common.document.Format`.
     missions : mapping of str to Mission
         Missions by name, which is also the name of their command.
+    commands : mapping of str to str
+        Commands at the top level, like those of the core, for kinds of runs that have some; each
+        object is a `click.Command`.
     """
 
     kinds: Mapping[str, str] = field(default_factory=dict)
     formats: Mapping[str, str] = field(default_factory=dict)
     missions: Mapping[str, Mission] = field(default_factory=dict)
+    commands: Mapping[str, str] = field(default_factory=dict)
 
 
 @cache

@@ -1,12 +1,18 @@
-"""The core knows no file format of a single observatory and no mission: it names none."""
+"""The core names no observatory and none of its files, and works while all plugins are hidden."""
 
 from __future__ import annotations
 
 import re
 
-from tests.app.support import REPOSITORY
+import pytest
 
-SHELVES = ("formats", "kinds", "missions", "app/kinds")  # folders of bayesdist
+from bayesdist.app.config import MatchesConfig, config_of_record, installed_kinds, parse_config
+from bayesdist.errors import ConfigError
+from bayesdist.plugin import SELECTION
+from tests.app.support import REPOSITORY
+from tests.toy import forget
+
+SHELVES = ("formats", "kinds", "missions")  # folders of bayesdist
 WORDS = re.compile(r"\b(IDCTAB|VAFACTOR|hst1pass|WISE|ACS)\b")
 
 
@@ -22,3 +28,44 @@ def test_no_file_of_the_core_names_a_mission_or_its_files():
         if WORDS.search(line)
     ]
     assert not found, "\n".join(found)
+
+
+CAMPAIGN = {"lists": "l", "catalog": "c", "exposures": "e", "initial_distortion": "i"}
+
+
+@pytest.fixture
+def core_alone(monkeypatch):
+    """All plugins are hidden."""
+    monkeypatch.setenv(SELECTION, "")
+    forget()
+    yield
+    forget()
+
+
+@pytest.mark.usefixtures("core_alone")
+def test_matched_stars_are_the_kind_of_the_core():
+    assert list(installed_kinds()) == ["data"]
+    text = "[data]\nmatches = 'stars.csv'\n[detector]\nsize = [9, 9]\n[model]\norder = 2\n"
+    config = parse_config(text, "c.toml")
+    assert isinstance(config, MatchesConfig)
+
+
+@pytest.mark.usefixtures("core_alone")
+def test_a_campaign_is_refused_in_a_sentence_if_its_kind_is_not_installed():
+    text = "[campaign]\n" + "".join(f"{key} = '{value}'\n" for key, value in CAMPAIGN.items())
+    with pytest.raises(ConfigError) as caught:
+        parse_config(f"{text}[model]\norder = 2\n", "c.toml")
+    assert caught.value.cause == (
+        "no installed kind of run has [campaign]: a run begins with [data], matched stars"
+    )
+    assert caught.value.where == "c.toml" and "install the plugin" in caught.value.do
+    with pytest.raises(ConfigError, match="no installed kind of run has") as caught:
+        config_of_record({"campaign": CAMPAIGN, "model": {"order": 2}}, "run.json")
+    assert caught.value.where == "run.json"
+
+
+@pytest.mark.usefixtures("core_alone")
+def test_without_any_kind_a_section_of_all_runs_is_not_to_blame():
+    with pytest.raises(ConfigError, match="a run begins with") as caught:
+        parse_config("[model]\norder = 2\n", "c.toml")
+    assert caught.value.do == "give one"

@@ -23,7 +23,7 @@ from pydantic import BaseModel
 import bayesdist as bd
 from bayesdist import formats
 from bayesdist.app.cli import bayesdist as root
-from bayesdist.app.config import KINDS
+from bayesdist.app.config import installed_kinds
 from bayesdist.app.config.data import data_sections
 from bayesdist.missions import wise
 from bayesdist.plugin import load_object
@@ -266,7 +266,7 @@ def _configured(kind: type[BaseModel], section: str = "") -> set[tuple[str, str]
 
 def _configured_of_any_kind() -> set[tuple[str, str]]:
     own = {pair for section in data_sections().values() for pair in _configured(section, "data")}
-    return own | {pair for kind in KINDS.values() for pair in _configured(kind)}
+    return own | {pair for kind in installed_kinds().values() for pair in _configured(kind)}
 
 
 def _models(annotation: object) -> list[type[BaseModel]]:
@@ -307,7 +307,7 @@ SECTIONS = "|".join(
     sorted(
         {
             name
-            for kind in KINDS.values()
+            for kind in installed_kinds().values()
             for name, field in kind.model_fields.items()
             if _models(field.annotation)
         }
@@ -341,7 +341,9 @@ def test_keys_that_errors_advise_exist():
             assert f"{section}.{key}" in configured, f"{name}: {text}"
             found += 1
             if value:
-                known = {v for one in KINDS.values() for v in _values_of(one, section, key)}
+                known = {
+                    v for one in installed_kinds().values() for v in _values_of(one, section, key)
+                }
                 assert value in known, f"{name}: {text}"
     assert found > 20
 

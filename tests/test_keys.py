@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 from pydantic import BaseModel
 
-from bayesdist.app.commands.patterns.config import PlanConfig
-from bayesdist.app.config import KINDS, parse_config
+from bayesdist.app.config import installed_kinds, parse_config
 from bayesdist.app.config.data import data_sections
+from bayesdist.kinds.selfcal.patterns.config import PlanConfig
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 PAGES = ("configuration.md", "campaign.md", "self_calibration.md", "planning.md")
@@ -63,7 +63,7 @@ def fields(kind: type[BaseModel], section: str = "") -> typing.Iterator[tuple[st
 def known() -> dict[tuple[str, str], list[object]]:
     """Fields of each section and key, one for each kind of run that has it."""
     found: dict[tuple[str, str], list[object]] = {}
-    for kind in KINDS.values():
+    for kind in installed_kinds().values():
         for section, key, field in fields(kind):
             found.setdefault((section, key), []).append(field)
     for kind in data_sections().values():

@@ -17,7 +17,7 @@ from bayesdist.app.commands.options import LazyGroup
 from bayesdist.app.screen import open_streams
 from bayesdist.errors import BayesdistError, BayesdistWarning, RenamedError
 from bayesdist.files.faults import InterruptHandler, installed_handler, raising_interrupts
-from bayesdist.plugin import mission_objects, missions
+from bayesdist.plugin import mission_objects, missions, plugins
 from bayesdist.version import __version__
 
 _LONGEST = 1000  # largest number of characters of a sentence
@@ -32,8 +32,8 @@ CORE = {
     name: f"{COMMANDS}.{module}:{name.replace('-', '_')}"
     for module, names in {
         "runs": "init check run stage report requirements budget",
-        "planning": "plan plan-dither select-order",
-        "calibrations": "monitor compare inspect apply convert release",
+        "planning": "plan select-order",
+        "calibrations": "monitor compare inspect apply convert",
         "documentation": "docs",
     }.items()
     for name in names.split()
@@ -63,14 +63,12 @@ EXAMPLES = {
     "requirements": "requirements camera-run --requirements limits.toml",
     "budget": "budget camera-run --at 100 100 --to 1900 1900",
     "plan": "plan camera-run",
-    "plan-dither": "plan-dither patterns.toml",
     "select-order": "select-order camera.toml --orders 2 6",
     "monitor": "monitor camera-run new_stars.csv",
     "compare": "compare camera-run old.hdr",
     "inspect": "inspect camera.hdr",
     "apply": "apply camera.hdr stars.csv -o sky.ecsv --sky",
     "convert": "convert camera.hdr --to tpv -o camera-tpv.hdr",
-    "release": "release camera-run -o release",
     "docs": "docs method",
 }
 
@@ -80,12 +78,18 @@ def _renamed(name: str, new: str) -> RenamedError:
     return RenamedError(f"the command {name!r} is {new!r} now", do=f"say 'bayesdist {new}'")
 
 
+def _commands_of_plugins() -> dict[str, str]:
+    """Locations of the commands of plugins as "module:object", by the name of the command."""
+    return {k: where for plugin in plugins().values() for k, where in plugin.commands.items()}
+
+
 class _Root(LazyGroup):
-    """Commands of the core, followed by those of missions."""
+    """Commands of the core, followed by those of plugins and of their missions."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         next_to_core = [name for mission in missions().values() for name in mission.beside_core]
-        return [*next_to_core, *super().list_commands(ctx), "simulate", *missions()]
+        core = super().list_commands(ctx)
+        return [*next_to_core, *core, *_commands_of_plugins(), "simulate", *missions()]
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         command = super().get_command(ctx, cmd_name)
@@ -93,6 +97,8 @@ class _Root(LazyGroup):
             if cmd_name in EXAMPLES:
                 command.epilog = f"Example: bayesdist {EXAMPLES[cmd_name]}"
             return command
+        if cmd_name in _commands_of_plugins():
+            return self.load(_commands_of_plugins()[cmd_name])
         if cmd_name in RENAMED:
             raise _renamed(cmd_name, RENAMED[cmd_name])
         if cmd_name in missions():

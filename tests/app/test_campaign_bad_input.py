@@ -12,13 +12,13 @@ from astropy.io import fits
 from astropy.table import Table, vstack
 from astropy.time import Time
 
-from bayesdist.app.kinds.campaign.input_validation import frames_not_set, shear_warnings
 from bayesdist.app.run import Run
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data import Matches
 from bayesdist.errors import DegenerateError
 from bayesdist.files.tables import read_table
 from bayesdist.infer import fit_linear, load_fit
+from bayesdist.kinds.campaign.input_validation import frames_not_set, shear_warnings
 from bayesdist.model import Chip, DistortionModel
 from tests.app.damaged import CONFIG, ONE, Campaign, masked, scattered, setting
 from tests.app.support import cli, good, one_sentence, refused, summary_of
@@ -616,7 +616,7 @@ def test_resuming_after_a_list_was_removed(resumable):
 def test_a_damaged_campaign_is_calibrated_and_says_so(campaign, monkeypatch):
     monkeypatch.setattr("bayesdist.app.stages.report", lambda results, pdf: [])
     # how linear terms went with time takes longer than all the rest, and is not asked here
-    monkeypatch.setattr("bayesdist.app.kinds.campaign.series.write_series_tables", lambda *_: None)
+    monkeypatch.setattr("bayesdist.kinds.campaign.series.write_series_tables", lambda *_: None)
     campaign.lists(scattered, ONE).lists(lambda t: t[t["chip"] == 1], "f606w-006")
     # a few steps: what is said does not rest on the draws
     campaign.replaced("target_ess = 100", "max_steps = 20")

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
-from bayesdist.app.kinds.campaign.parts import ExposuresAlone, ExposureScatter
 from bayesdist.app.pipeline import diagnose, fit, match
 from bayesdist.app.run import Run
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data import read_matches
 from bayesdist.files.tables import read_table
 from bayesdist.infer import load_fit
+from bayesdist.kinds.campaign.parts import ExposuresAlone, ExposureScatter
 from tests.app.support import (
     carried_out,
     cli,
@@ -80,7 +80,7 @@ def begin(folder: Path, run: Path, names: list[str], *, holdout: str = "", drift
 def run(folder):
     run = begin(folder, folder.parent / "release", parts(folder)[0], holdout=HOLDOUT)
     # how linear terms went with time takes longer than all the rest, and is not asked here
-    with patch("bayesdist.app.kinds.campaign.series.write_series_tables"):
+    with patch("bayesdist.kinds.campaign.series.write_series_tables"):
         return carried_out(run, "match", "fit", "sample", "diagnose")
 
 

@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from bayesdist.app.config import KINDS, load_config, load_requirements, parse_config
+from bayesdist.app.config import installed_kinds, load_config, load_requirements, parse_config
 from bayesdist.app.config.errors import INSTEAD, RENAMED
 from bayesdist.errors import ConfigError, InputError
 from bayesdist.infer import Compute
@@ -339,6 +339,8 @@ def test_a_missing_file_and_a_folder(tmp_path):
         with pytest.raises(InputError, match=word):
             load_config(path)
 
+
+KINDS = installed_kinds()
 
 # -- three kinds ----------------------------------------------------------------------------------
 

@@ -171,6 +171,18 @@ def test_a_kind_of_another_package_is_run_and_continued(run):
     assert (run / "mask.txt").read_text() == repr(SCALE_SIGMA)
 
 
+def test_it_is_found_even_if_it_is_imported_first(run):
+    """Its module imports the configurations of bayesdist, which must not ask for it too early."""
+    code = "import spots.kind; from bayesdist.app.config import installed_kinds as kinds; "
+    code += "print(*kinds())"
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", code],
+        env={**os.environ, "PYTHONPATH": str(run.parent)},
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.stdout.split() == ["data", "campaign", "selfcal", "spots"], done.stderr
+
+
 def test_its_error_term_is_in_the_budget(run):
     """A relative error of the scale moves a position by its distance from the reference pixel."""
     budget = Table.read(run / "budget.ecsv")

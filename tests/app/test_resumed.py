@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from bayesdist.app.config import KINDS, load_config
+from bayesdist.app.config import installed_kinds, load_config
 from bayesdist.app.store import Made
 from bayesdist.app.store.keys import digest_of
 from bayesdist.app.store.lock import locked
@@ -179,7 +179,7 @@ def test_a_run_of_an_older_schema(finished, run, tmp_path):
     refused(tmp_path, "budget", run, "--at", 1, 1, words=words)
 
 
-@pytest.mark.parametrize("kind", sorted(KINDS))
+@pytest.mark.parametrize("kind", sorted(installed_kinds()))
 def test_each_key_is_of_the_solution_or_of_what_comes_later(tmp_path, kind):
     """What may change on resuming is what is in no key of match, fit and chains."""
     block = {

@@ -8,8 +8,6 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from bayesdist.app.kinds.campaign.inputs import errors_by_star
-from bayesdist.app.kinds.campaign.matched import PERIOD, SWING, scale_error
 from bayesdist.assess.model import with_shared_stars
 from bayesdist.assess.terms.parameters import CATALOGUE as POSITIONS
 from bayesdist.assess.terms.parameters import MOTIONS, catalogue_terms
@@ -17,6 +15,8 @@ from bayesdist.data import Matches, ReferenceCatalog
 from bayesdist.diagnose.diagnostics import catalogue_covariance
 from bayesdist.infer import Posterior, Rejection, fit_linear
 from bayesdist.infer.stars.likelihood import OutlierMixture
+from bayesdist.kinds.campaign.inputs import errors_by_star
+from bayesdist.kinds.campaign.matched import PERIOD, SWING, scale_error
 from bayesdist.model import Chip, DistortionModel
 
 STARS, EXPOSURES = 60, 9

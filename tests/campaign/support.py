@@ -13,8 +13,6 @@ from unittest import mock
 import numpy as np
 
 from bayesdist.app.config import load_config
-from bayesdist.app.kinds.campaign import fit as stage
-from bayesdist.app.kinds.campaign.matched import affine_model_of
 from bayesdist.app.run import Run
 from bayesdist.app.stages import make_stages
 from bayesdist.app.store.rundir import RunDirectory
@@ -23,6 +21,8 @@ from bayesdist.infer.exposures.hierarchy import HierarchicalFit
 from bayesdist.infer.nodes import Matern, NodeGrid, TableFit
 from bayesdist.infer.series import Series
 from bayesdist.infer.solution.solution import TransformedSolution
+from bayesdist.kinds.campaign import fit as stage
+from bayesdist.kinds.campaign.matched import affine_model_of
 from bayesdist.missions.hst.simulate import AcsCampaign, acs_model, read_acs
 from bayesdist.missions.hst.simulate.pointings import OWN
 from bayesdist.model import DistortionModel, LookupTable

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from lxml import html as lxml_html
 
-from bayesdist.app.kinds.campaign.checks import campaign_checks
-from bayesdist.app.kinds.campaign.report import held_parameters
 from bayesdist.diagnose.checks import structure_checks
 from bayesdist.diagnose.residuals.misfit import Misfit
 from bayesdist.infer import GaussianPriors, fit_linear
+from bayesdist.kinds.campaign.checks import campaign_checks
+from bayesdist.kinds.campaign.report import held_parameters
 from bayesdist.missions.hst.published import LINES, published_lines
 from bayesdist.missions.hst.simulate.distortion import DRIFT
 from bayesdist.model import Chip, TimeDependence

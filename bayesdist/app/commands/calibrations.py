@@ -1,4 +1,4 @@
-"""Commands on calibrations in files or runs: inspect, apply, convert, compare, monitor, release."""
+"""Commands on calibrations in files or runs: inspect, apply, convert, compare, monitor."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from bayesdist.app.commands.options import (
     filter_name,
     force,
     image_size,
-    new_folder,
     pixel_scale,
 )
 
@@ -209,17 +208,4 @@ def monitor() -> None:
 
     NEW is a table of matches, or a CONFIG.toml, a run or a folder with a config.toml
     that names them.
-    """
-
-
-@command(calls=f"{ON_RUNS}.release:release_runs", recorded=True)
-@click.argument("runs", nargs=-1, required=True, metavar="RUN...", type=click.Path())
-@new_folder
-@click.option(
-    "--allow-unconverged", is_flag=True, help="Release runs that have not converged, too."
-)
-def release() -> None:
-    """Write one set of files from the runs of several filters.
-
-    The first run is that of the reference filter.
     """

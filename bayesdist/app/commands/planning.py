@@ -1,4 +1,4 @@
-"""Commands for planning: exposures, dither patterns, and the polynomial order."""
+"""Commands for planning: further exposures, and the polynomial order."""
 
 from __future__ import annotations
 
@@ -21,21 +21,6 @@ from bayesdist.app.commands.options import ON_RUNS, CommaList, Unused, command, 
 )
 def plan() -> None:
     """Compute how many more exposures would meet the requirements."""
-
-
-@command(
-    calls="bayesdist.app.commands.patterns.command:plan_patterns", recorded=True, name="plan-dither"
-)
-@click.argument("path", metavar="PATTERNS.toml", type=click.Path())
-@click.option(
-    "-o",
-    "--output",
-    type=click.Path(),
-    metavar="DIR",
-    help="Folder to create for table, record and figure.",
-)
-def plan_dither() -> None:
-    """Compare dither patterns for a self-calibration, without data."""
 
 
 @command(

@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias, Union
 
 from pydantic import Discriminator, Field, Tag, TypeAdapter, ValidationError
 
 from bayesdist.app.config.assess import RequirementBlock
-from bayesdist.app.config.campaign import CampaignConfig
 from bayesdist.app.config.data import MatchesConfig
 from bayesdist.app.config.errors import as_config_error
 from bayesdist.app.config.run import RunConfig
 from bayesdist.app.config.section import Section
-from bayesdist.app.config.selfcal import SelfcalConfig
 from bayesdist.assess import Requirement
 from bayesdist.errors import ConfigError, InputError
 from bayesdist.files.documents import toml_of
@@ -25,11 +24,16 @@ from bayesdist.files.regular import MOST_TEXT, read_text
 from bayesdist.plugin import objects
 from bayesdist.utils.text import refuse_control_characters
 
+Config: TypeAlias = RunConfig
 
-def _installed_kinds() -> dict[str, type[RunConfig]]:
-    """Configurations of this and of other packages, by the section that determines the kind."""
-    ours = {"data": MatchesConfig, "campaign": CampaignConfig, "selfcal": SelfcalConfig}
-    return {**objects(lambda plugin: plugin.kinds, flaw=_flaw), **ours}
+
+def installed_kinds() -> dict[str, type[RunConfig]]:
+    """Configurations of this and of other packages, by the section that determines the kind.
+
+    The plugins are asked at each call, not when this module is imported: their modules import it.
+    """
+    ours: dict[str, type[RunConfig]] = {"data": MatchesConfig}
+    return ours | objects(lambda plugin: plugin.kinds, flaw=_flaw) | ours
 
 
 def _flaw(kind: object) -> str:
@@ -40,30 +44,51 @@ def _flaw(kind: object) -> str:
     return f"it has no attribute {missing[0]!r}" if missing else ""
 
 
-KINDS = _installed_kinds()
+def _kinds_given(raw: Any, kinds: Iterable[str]) -> list[str]:
+    """Sections of a configuration that determine its kind."""
+    return [kind for kind in kinds if isinstance(raw, dict) and raw.get(kind) is not None]
 
 
-def _kind_of(raw: Any) -> str | None:
-    """Section that determines the kind of a configuration; None unless there is exactly one."""
-    kinds = [kind for kind in KINDS if isinstance(raw, dict) and raw.get(kind) is not None]
-    return kinds[0] if len(kinds) == 1 else None
-
-
-def _begins_with() -> str:
+def _beginnings(kinds: Mapping[str, type[RunConfig]]) -> str:
     """Clause that lists the sections a run may begin with."""
-    *first, last = (f"with [{section}], {kind.title}" for section, kind in KINDS.items())
-    return f"a run begins {', '.join(first)}, or {last}; give one"
+    clauses = [f"with [{section}], {kind.title}" for section, kind in kinds.items()]
+    *first, last = clauses
+    return f"a run begins {', '.join(first)}, or {last}" if first else f"a run begins {last}"
 
 
-Config: TypeAlias = RunConfig
+@cache
+def _adapter(kinds: tuple[tuple[str, type[RunConfig]], ...]) -> TypeAdapter[Config]:
+    """Validator of the configurations of these kinds."""
+    sections = [section for section, _ in kinds]
 
-_UNION: Any = Union[*(Annotated[kind, Tag(section)] for section, kind in KINDS.items())]
-CONFIG: TypeAdapter[Config] = TypeAdapter(
-    Annotated[
-        _UNION,
-        Discriminator(_kind_of, custom_error_type="no_kind", custom_error_message=_begins_with()),
-    ]
-)
+    def kind_of(raw: Any) -> str | None:
+        given = _kinds_given(raw, sections)
+        return given[0] if len(given) == 1 else None
+
+    union: Any = Union[*(Annotated[kind, Tag(section)] for section, kind in kinds)]
+    message = f"{_beginnings(dict(kinds))}; give one"
+    return TypeAdapter(
+        Annotated[
+            union,
+            Discriminator(kind_of, custom_error_type="no_kind", custom_error_message=message),
+        ]
+    )
+
+
+def _refuse_other_kinds(
+    kinds: Mapping[str, type[RunConfig]], raw: Mapping[str, Any], where: str
+) -> None:
+    """Refuse a configuration that begins with a section of no installed kind."""
+    if _kinds_given(raw, kinds):
+        return
+    known = {section for kind in kinds.values() for section in kind.model_fields}
+    if unknown := [f"[{section}]" for section in raw if section not in known]:
+        raise ConfigError(
+            f"no installed kind of run has {' or '.join(unknown)}: {_beginnings(kinds)}",
+            where=where,
+            do="begin with one of these, or install the plugin of the kind (BAYESDIST_PLUGINS may "
+            "exclude it)",
+        )
 
 
 # limits on numbers: beyond plausible values in any unit, but far from overflow
@@ -128,7 +153,9 @@ def parse_config(text: str, where: str) -> Config:
         If the configuration is invalid.
     """
     raw = _settings(text, where, begin="write one by 'bayesdist init'")
-    config = _validated(CONFIG, KINDS, raw, where)
+    kinds = installed_kinds()
+    _refuse_other_kinds(kinds, raw, where)
+    config: Config = _validated(_adapter(tuple(kinds.items())), kinds, raw, where)
     with _as_config_errors(where):
         config.time()
         # matches may state their radius, which is unknown until they are read
@@ -159,10 +186,12 @@ def config_of_record(settings: Mapping[str, Any], where: str) -> Config:
     ConfigError
         If the settings are invalid, for example if they are from another version.
     """
+    kinds = installed_kinds()
+    _refuse_other_kinds(kinds, settings, where)
     try:
-        return CONFIG.validate_python(settings)
+        return _adapter(tuple(kinds.items())).validate_python(settings)
     except ValidationError as error:
-        raise as_config_error(KINDS, error, where) from error
+        raise as_config_error(kinds, error, where) from error
 
 
 def load_requirements(path: str | Path) -> tuple[Requirement, ...]:

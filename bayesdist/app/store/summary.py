@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-from bayesdist.app.config import KINDS
+from bayesdist.app.config import installed_kinds
 
 Number = float | None  # null where it is not finite, or not known
 
@@ -399,7 +399,7 @@ class Summary(Sections):
 def head_of(facts: Mapping[str, Any]) -> dict[str, Any]:
     """Entries of summary.json about the run as a whole."""
     config = facts["config"]
-    kind = next(name for name in KINDS if name in config)
+    kind = next(name for name in installed_kinds() if name in config)
     chips = " and ".join(chip["name"] for chip in config["chip"])
     parts = [config["detector"]["name"] or chips, config[kind].get("filter")]
     return {

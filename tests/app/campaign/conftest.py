@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from bayesdist.app.kinds.campaign import series
+from bayesdist.kinds.campaign import series
 from tests.app.support import edit, good
 
 # coarse nodes and few draws: quick.  Wider cells than the pattern's leave the linear terms alone;

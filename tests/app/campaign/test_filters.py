@@ -12,12 +12,9 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
-import bayesdist.app.commands.on_runs.release
+import bayesdist.kinds.campaign.release
 import bayesdist.missions.hst.release
 from bayesdist.app.artefacts.parts import StoredLookupTables, read_tables, write_tables
-from bayesdist.app.commands.on_runs.filters import compare_filters
-from bayesdist.app.commands.on_runs.release import _require_alike
-from bayesdist.app.kinds.campaign.reference import held_tables
 from bayesdist.app.run import Run
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess import LocalErrors
@@ -32,6 +29,9 @@ from bayesdist.infer.exposures.shared_drift import drift_priors, with_drift_of
 from bayesdist.infer.nodes.fit import held_sigma
 from bayesdist.infer.series import Series, fit_series
 from bayesdist.infer.solution.transforms import linear_terms, lines, reference_gauge, without_frames
+from bayesdist.kinds.campaign.filters import compare_filters
+from bayesdist.kinds.campaign.reference import held_tables
+from bayesdist.kinds.campaign.release import _require_alike
 from bayesdist.missions.hst.simulate import acs_solution, making, read_acs, simulate_acs
 from bayesdist.model import LookupTable, TimeDependence, corrected
 from tests.app.support import carried_out, cli, good, one_sentence, replaced, snapshot
@@ -403,7 +403,7 @@ def test_nothing_is_left_of_a_release_that_fails_late(runs, tmp_path, monkeypatc
         raise InputError("not of interest here")
 
     # it takes a while
-    monkeypatch.setattr(bayesdist.app.commands.on_runs.release, "compare_filters", has_none)
+    monkeypatch.setattr(bayesdist.kinds.campaign.release, "compare_filters", has_none)
     monkeypatch.setattr(bayesdist.missions.hst.release, "write_npol", fails)
     refused(tmp_path, *runs.values(), words=["the disk is full"])
 

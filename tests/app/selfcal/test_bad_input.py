@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from astropy.table import Table, vstack
 
-from bayesdist.app.kinds.selfcal.matching import refuse_unconnected
 from bayesdist.errors import InputError
+from bayesdist.kinds.selfcal.matching import refuse_unconnected
 from tests.app.selfcal.support import list_table, small, write_selfcal
 from tests.app.support import cli, one_sentence, refused
 from tests.dithered_fields import simulate_dithers, smooth_distortion

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
-from bayesdist.app.kinds.selfcal.inputs import read_commanded
 from bayesdist.errors import InputError
+from bayesdist.kinds.selfcal.inputs import read_commanded
 
 
 def commanded(folder, given: str, unit: str, scale_mas: float | None):

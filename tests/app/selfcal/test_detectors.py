@@ -11,12 +11,12 @@ from astropy.table import Table
 from astropy.wcs import WCS
 from scipy import stats
 
-from bayesdist.app.kinds.selfcal.stars import star_table
 from bayesdist.app.store.output import write_table
 from bayesdist.data.sky import parallax_factors
 from bayesdist.infer import load_fit
 from bayesdist.infer.selfcal import star_catalogue
 from bayesdist.infer.selfcal.sky_moves import functionals
+from bayesdist.kinds.selfcal.stars import star_table
 from bayesdist.simulate.dithers import pixels_of
 from tests.app.selfcal.support import (
     SCALE_MAS,

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
-from bayesdist.app.kinds.selfcal.matched import FirstSolution
 from bayesdist.diagnose.selfcal.tests import selfcal_score_tests
+from bayesdist.kinds.selfcal.matched import FirstSolution
 from tests.app.selfcal.support import fitted, write_selfcal
 from tests.app.support import good
 from tests.infer.selfcal.wide import ARCSEC, MIDDLE, N, observed, on, tangent_plane

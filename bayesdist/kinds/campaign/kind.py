@@ -1,0 +1,242 @@
+"""Runs that begin with star lists and a reference catalogue."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from bayesdist.app.artefacts.parts import TABLES, read_tables
+from bayesdist.app.artefacts.stored_fit import read_stored_fit
+from bayesdist.app.kinds.kind import EvaluationDomain, Outline, Questions, RunKind
+from bayesdist.app.kinds.sampling import sample_stars
+from bayesdist.app.run import Run
+from bayesdist.assess.model import with_diagnosed_errors
+from bayesdist.assess.terms.correlated import LocalErrors, interpolation_term
+from bayesdist.assess.terms.forms import GIVEN, MEASURED, ErrorTerm
+from bayesdist.assess.terms.parameters import ExposureVariation
+from bayesdist.data import Matches, ReferenceCatalog
+from bayesdist.diagnose.holdout.predictive import ExposureDeviations, Predictive, predictive_of
+from bayesdist.diagnose.overlap import OverlapTest
+from bayesdist.infer import Posterior
+from bayesdist.infer.catalogue.star_errors import StarErrors, StarInfluence, star_influence
+from bayesdist.infer.solution.solution import Solution
+from bayesdist.kinds.campaign.checks import campaign_checks
+from bayesdist.kinds.campaign.config import CampaignConfig
+from bayesdist.kinds.campaign.fit import fit_campaign
+from bayesdist.kinds.campaign.input_validation import refuse_campaign
+from bayesdist.kinds.campaign.inputs import (
+    Inputs,
+    errors_by_star,
+    outline_of_campaign,
+    read_campaign,
+)
+from bayesdist.kinds.campaign.linear_terms import line_sections
+from bayesdist.kinds.campaign.matched import (
+    aberration_term,
+    load_matched_campaign,
+    overlap_of,
+)
+from bayesdist.kinds.campaign.matching import campaign_lines, match_lists
+from bayesdist.kinds.campaign.parts import ExposureScatter
+from bayesdist.utils.checks import Check
+
+if TYPE_CHECKING:
+    from bayesdist.infer.compare.monitoring import NewFit
+
+SAMPLING = 1  # number of the random stream of the stage 'sample', derived from the seed
+TOGETHER = 1.5  # node spacings over which errors of tables are correlated, from their covariance
+
+
+class CampaignKind(RunKind[CampaignConfig, Inputs]):
+    """Star lists, which are matched to a reference catalogue; exposures are fitted jointly."""
+
+    section = "matching"
+    along_detector = True
+
+    def read(self, config: CampaignConfig, base: Path) -> Inputs:
+        """Catalogue, exposure log and star lists."""
+        return read_campaign(config, base)
+
+    def refuse(self, inputs: Inputs) -> None:
+        """Refuse inconsistent inputs, and files of other runs that cannot be used."""
+        refuse_campaign(inputs)
+
+    def lines(self, inputs: Inputs) -> Iterator[str]:
+        """Lines about the inputs, dates and roll angles."""
+        return campaign_lines(inputs)
+
+    def outline(self, inputs: Inputs) -> Outline:
+        """Shape of the solution, with its look-up tables."""
+        return outline_of_campaign(inputs)
+
+    def with_config(self, inputs: Inputs, config: CampaignConfig) -> Inputs:
+        """Inputs for another configuration, which differs in the model only."""
+        return replace(inputs, config=config)
+
+    def match(self, run: Run) -> Run:
+        """Run with the stars that match the catalogue."""
+        return match_lists(run)
+
+    def load_matched(self, run: Run) -> Run:
+        """Run with the pairs of an earlier stage."""
+        return load_matched_campaign(run)
+
+    def fit(self, run: Run) -> Run:
+        """Run with look-up tables, errors, and all exposures fitted jointly and each alone."""
+        return fit_campaign(run)
+
+    def load_fit(self, run: Run) -> Run:
+        """Run with the fit of an earlier stage and its look-up tables."""
+        folder = run.directory.path
+        artefacts = read_stored_fit(folder)
+        tables = read_tables(folder / TABLES, do="run the stage 'fit' again")
+        return run.having(**{**artefacts, "parts": {"tables": tables, **artefacts["parts"]}})
+
+    def fit_notes(self, run: Run) -> Iterator[tuple[int, str]]:
+        """Warnings about deviations of the exposures, and the scatter of the exposures."""
+        facts = run.fit_facts
+        for text in facts["deviations"]["warnings"]:
+            yield logging.WARNING, text
+        sizes = ", ".join(f"{name} {term['value']:.2g}" for name, term in facts["scatter"].items())
+        yield logging.INFO, f"scatter of the exposures {sizes}"
+
+    def sample(
+        self,
+        run: Run,
+        *,
+        folder: Path | None = None,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> Posterior:
+        """Posterior in which each chip has its mean position over the exposures."""
+        posterior = sample_stars(run, folder=folder, progress=progress)
+        rng = np.random.default_rng([run.config.sampler.seed, SAMPLING])
+        return run.part(ExposureScatter).averaged(posterior, rng)
+
+    def questions(self, run: Run) -> Questions:
+        """Structure is tested if no tables were fitted; their errors are in the budget."""
+        return Questions(
+            centroid=run.errors.by_magnitude,
+            structure=run.config.tables.method == "none",
+            exposures=False,
+            settling=run.part(ExposureScatter).offsets,
+        )
+
+    def overlap(self, run: Run) -> OverlapTest | None:
+        """Comparison of two exposures far apart in time; None if there is no such pair."""
+        return overlap_of(run)
+
+    def save_diagnosed(self, run: Run) -> None:
+        """Write the linear terms of the exposures as a function of time."""
+        from bayesdist.kinds.campaign import series  # slow to import
+
+        series.write_series_tables(run)
+
+    def predictive(self, run: Run) -> Predictive:
+        """Prediction with the scatter of exposures, and errors of catalogue and tables."""
+        scatter, settings = run.part(ExposureScatter), run.evaluation_settings
+        cell, tables = None, run.tables.tables
+        if tables:
+            across, up = tables[0].step
+            cell = TOGETHER * across, TOGETHER * up
+        return replace(
+            predictive_of(with_diagnosed_errors(run.posterior, run.diagnostics, run.fit)),
+            deviations=ExposureDeviations(scatter.kinds, scatter.tau),
+            stars=_reference_stars(run),
+            local=run.error_model.local_tables(settings.grid, settings.epoch),
+            cell=cell,
+        )
+
+    def error_terms(self, run: Run, solution: Solution) -> list[ErrorTerm]:
+        """Deviation of a new exposure, errors of the tables, and what the user states.
+
+        The deviation is the measured scatter, which includes velocity aberration.
+        """
+        scatter, config = run.part(ExposureScatter), run.config
+        deviation = ExposureVariation(
+            solution.model,
+            np.asarray(solution.mean, float),
+            scatter.kinds,
+            scatter.tau,
+            aberration=aberration_term(scatter.kinds, scatter.tau, run.inputs, solution),
+        )
+        stated = config.user_terms(solution.model.unit)
+        tables = _table_terms(run, solution)
+        return [deviation, *config.linear_terms(solution), *tables, *stated]
+
+    def domain(self, run: Run) -> EvaluationDomain:
+        """A new exposure, whose user fits shift and rotation."""
+        return EvaluationDomain(aligned=True, structure_left=not run.tables.position_sigma)
+
+    def checks(self, run: Run) -> tuple[Check, ...]:
+        """Checks of matching, look-up tables and exposures."""
+        facts = {self.section: run.match_facts, **run.fit_facts}
+        return campaign_checks(facts | {"time_dependence": run.time_dependence})
+
+    def evaluation_sections(self, run: Run) -> dict[str, Any]:
+        """Linear terms as lines in time."""
+        return line_sections(run.solution, run.config.chips()[0].number)
+
+    def report_parts(self, run: Run) -> dict[str, Any]:
+        """Catalogue, matching, tables and series, and the words of a campaign."""
+        from bayesdist.kinds.campaign.report import report_fields  # needed by one stage
+
+        return report_fields(run)
+
+    def fit_of_new_exposures(
+        self, release: Run, new: Path
+    ) -> tuple[Matches, NewFit, tuple[str, ...]]:
+        """Fit of new exposures, which scatter as those of the release do."""
+        from bayesdist.kinds.campaign.monitoring import fit_new_exposures  # for one command
+
+        return fit_new_exposures(release, new)
+
+    def catalogue(self, run: Run) -> ReferenceCatalog:
+        """Reference catalogue with the stars that are used."""
+        inputs: Inputs = run.inputs
+        return inputs.catalog
+
+    def star_errors(self, run: Run) -> StarErrors | None:
+        """Errors of the catalogue by star code; None if there are none."""
+        inputs: Inputs = run.inputs
+        return errors_by_star(inputs.catalog, inputs.largest_vafactor)
+
+    def filter(self, run: Run) -> str:
+        """Filter of the exposures."""
+        inputs: Inputs = run.inputs
+        return inputs.filter
+
+
+def _reference_stars(run: Run) -> StarInfluence | None:
+    """Influence of the catalogue errors on the fit, for stars of exposures held out entirely.
+
+    These stars were fitted in other exposures, which does not show in their residuals.
+    """
+    errors, held = run.kind.star_errors(run), run.held_stars
+    if errors is None or held is None or held.star is None:
+        return None
+    is_held = np.isin(held.exposure_names, run.held_exposures)
+    codes = np.unique(held.star[is_held[held.exposure]])
+    return star_influence(run.fit, run.matches, errors, codes)
+
+
+def _table_terms(run: Run, solution: Solution) -> tuple[LocalErrors, ...]:
+    """Terms for the errors of the tables, and for the distortion between their nodes."""
+    stored, block, grid = run.tables, run.config.tables, run.config.assess.grid
+    between = interpolation_term(stored.between, solution, grid=grid, epoch=run.epoch)
+    if not stored.position_sigma:
+        return between
+    source = MEASURED
+    if block.detector is not None:
+        of_detector = f"{GIVEN}: errors of the detector's tables in {block.detector}"
+        source = of_detector if block.method == "none" else f"{MEASURED}, and {of_detector}"
+    name = "look-up tables"
+    tables = LocalErrors.on_grid(name, stored.position_sigma, solution.model, source)
+    return (tables, *between)
+
+
+CAMPAIGN = CampaignKind()

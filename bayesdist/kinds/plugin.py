@@ -1,0 +1,14 @@
+"""Entry point of the kinds of runs, and of the commands that only one kind has."""
+
+from bayesdist.plugin import Plugin
+
+PLUGIN = Plugin(
+    kinds={
+        "campaign": "bayesdist.kinds.campaign.config:CampaignConfig",
+        "selfcal": "bayesdist.kinds.selfcal.config:SelfcalConfig",
+    },
+    commands={
+        "plan-dither": "bayesdist.kinds.selfcal.commands:plan_dither",
+        "release": "bayesdist.kinds.campaign.commands:release",
+    },
+)

@@ -1,0 +1,145 @@
+"""Configuration of a self-calibration, which begins with star lists alone, and of its gauge."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, ClassVar, Literal
+
+from pydantic import Field, PositiveFloat
+
+from bayesdist.app.config.data import names_nominal
+from bayesdist.app.config.fit import ComputeBlock, Fit, SelfcalOutliers, SelfcalSampler
+from bayesdist.app.config.model import PriorBlock, SelfcalModel, TablesBlock
+from bayesdist.app.config.products import SelfcalProducts
+from bayesdist.app.config.run import POSTERIOR, RunConfig
+from bayesdist.app.config.section import Epoch, Section, Unit
+from bayesdist.infer import OutlierMixture
+from bayesdist.kinds.star_lists import StarListsBlock
+
+Frames = Literal["shift", "shift_rotation", "shift_rotation_scale"]
+MinDetections = Annotated[int, Field(ge=2)]
+
+
+def scale_faults(sigma: float | None, frames: Frames) -> Iterator[str]:
+    """Fault of a scatter of scales when the exposures have no scales."""
+    if sigma is not None and "scale" not in frames:
+        yield (
+            "gauge.exposure_scale_sigma is given, and the exposures have no scales; set "
+            "selfcal.frames to 'shift_rotation_scale'"
+        )
+
+
+class SelfcalBlock(StarListsBlock):
+    """Star lists of dithered exposures, and the matching of their detections to stars."""
+
+    exposures: str | None = None
+    sigma: Literal["measured", "columns"] | PositiveFloat = "measured"
+    initial_distortion: str | None = None
+    unit: Literal["pix", "arcsec", "mas"] = "pix"
+    frames: Frames = "shift_rotation"
+    match_radius: PositiveFloat = 0.5
+    start_radius: PositiveFloat | None = None
+    min_detections: MinDetections = 2
+    max_iterations: Annotated[int, Field(ge=2)] = 12
+    motion: Literal["none", "proper_motion", "parallax"] = "none"
+
+    def faults(self) -> Iterator[str]:
+        """Fault of a match radius that would increase."""
+        if self.start_radius is not None and self.start_radius < self.match_radius:
+            yield (
+                "selfcal.start_radius is smaller than selfcal.match_radius; begin with the larger "
+                "one"
+            )
+
+
+class ScaleTie(Section):
+    """Pixel size as measured by another detector."""
+
+    mas: PositiveFloat
+    sigma: PositiveFloat
+    detector: str = ""
+
+
+class ReferenceBlock(Section):
+    """Reference stars in a catalogue."""
+
+    catalog: str
+    columns: dict[str, str] | None = None
+    unit: Unit | None = None
+    epoch: Epoch | None = None
+    tangent_point: tuple[float, float] | None = None
+    radius: PositiveFloat = 2.0
+
+
+class GaugeBlock(Section):
+    """Constraints in addition to the detections, each with its error."""
+
+    offsets: str | None = None
+    offset_sigma: PositiveFloat | None = None
+    roll_sigma_deg: PositiveFloat | None = None
+    exposure_scale_sigma: PositiveFloat | None = None
+    scale: ScaleTie | None = None
+    reference: ReferenceBlock | None = None
+
+    def faults(self) -> Iterator[str]:
+        """Faults of errors without the offsets that they apply to."""
+        for key in ("offset_sigma", "roll_sigma_deg"):
+            if getattr(self, key) is not None and self.offsets is None:
+                yield (
+                    f"gauge.{key} is given without gauge.offsets; name the file of the commanded "
+                    f"offsets, or leave {key} out"
+                )
+
+
+class SelfcalConfig(RunConfig):
+    """Configuration of a run that begins with star lists alone."""
+
+    kind: ClassVar[str] = "bayesdist.kinds.selfcal.kind:SELFCAL"
+    title: ClassVar[str] = "star lists alone"
+    tables: ClassVar[TablesBlock] = TablesBlock()
+    fit: ClassVar[Fit] = Fit()
+    periods: ClassVar[None] = None
+    holdout: ClassVar[None] = None
+    prior_calibration: ClassVar[None] = None
+
+    selfcal: SelfcalBlock
+    gauge: GaugeBlock = GaugeBlock()
+    model: SelfcalModel
+    outliers: SelfcalOutliers = SelfcalOutliers()
+    sampler: SelfcalSampler = SelfcalSampler()
+    compute: ComputeBlock = ComputeBlock()
+    prior: list[PriorBlock] = Field(default_factory=list)
+    products: SelfcalProducts = SelfcalProducts()
+
+    def faults(self) -> Iterator[str]:
+        """Faults of any run, and of settings that contradict the frames or need a scale."""
+        yield from super().faults()
+        if names_nominal(self.selfcal.columns):
+            yield (
+                "nominal positions are of matches in [data], and a [selfcal] finds its matches "
+                "itself; leave u_nominal and v_nominal out"
+            )
+        yield from scale_faults(self.gauge.exposure_scale_sigma, self.selfcal.frames)
+        if self.gauge.roll_sigma_deg is not None and "rotation" not in self.selfcal.frames:
+            yield (
+                "gauge.roll_sigma_deg is given, and the exposures have no rotations; set "
+                "selfcal.frames to 'shift_rotation'"
+            )
+        angles = self.gauge.scale is not None or self.gauge.reference is not None
+        if (angles or self.selfcal.unit != "pix") and self.detector.scale_mas is None:
+            yield "detector.scale_mas is missing, which turns pixels into seconds of arc; give it"
+
+    def named_files(self, base: Path) -> list[Path]:
+        """Star lists, log, initial distortion, and files of the constraints."""
+        block, gauge = self.selfcal, self.gauge
+        first, reference = block.initial_distortion, gauge.reference
+        if first is not None and (base / first).is_dir():
+            first = f"{first}/{POSTERIOR}"  # posterior of a run
+        named = [*block.list_names, block.exposures, first, gauge.offsets]
+        named.append(None if reference is None else reference.catalog)
+        return [base / name for name in dict.fromkeys(named) if name is not None]
+
+    def mixture(self, stated: float | None = None) -> OutlierMixture:  # noqa: ARG002 - used for matched stars
+        """Outlier mixture, within the configured match radius of a detection."""
+        return self.outliers.mixture(self.selfcal.match_radius)

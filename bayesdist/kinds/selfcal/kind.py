@@ -1,0 +1,147 @@
+"""Runs that begin with star lists alone."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from bayesdist.app.kinds.kind import EvaluationDomain, Outline, Questions, RunKind
+from bayesdist.app.run import Run
+from bayesdist.app.store.output import provenance_notes
+from bayesdist.infer import Posterior
+from bayesdist.kinds.selfcal.config import SelfcalConfig
+from bayesdist.kinds.selfcal.fit import fit_selfcal, load_selfcal, sample_detections
+from bayesdist.kinds.selfcal.inputs import (
+    Inputs,
+    outline_of_selfcal,
+    read_selfcal,
+    refuse_selfcal,
+)
+from bayesdist.kinds.selfcal.matched import load_matched_selfcal
+from bayesdist.kinds.selfcal.matching import match_dithers, selfcal_lines
+from bayesdist.kinds.selfcal.solved import SelfCalibrated
+from bayesdist.utils.arrays import Float
+from bayesdist.utils.checks import Check
+
+
+class SelfcalKind(RunKind[SelfcalConfig, Inputs]):
+    """Star lists of dithered exposures; the positions of the stars are fitted as well."""
+
+    section = "selfcal"
+    has_catalogue = False
+    along_detector = True
+    rows = "detections"
+    chooser = "limits of residuals"
+    rehearses_fit = True
+    new_frames = "affine"  # the orientation on the sky is unknown to a self-calibration
+    no_order = (
+        "is a self-calibration, whose stars take up what an order too low leaves, so that no star "
+        "that is held out shows it"
+    )
+
+    def read(self, config: SelfcalConfig, base: Path) -> Inputs:
+        """Detections, and additional constraints."""
+        return read_selfcal(config, base)
+
+    def refuse(self, inputs: Inputs) -> None:
+        """Refuse exposures that cannot be aligned, and an unreadable initial distortion."""
+        refuse_selfcal(inputs)
+
+    def lines(self, inputs: Inputs) -> Iterator[str]:
+        """Lines about stars and free directions."""
+        return selfcal_lines(inputs)
+
+    def outline(self, inputs: Inputs) -> Outline:
+        """Shape of the solution, from the initial model."""
+        return outline_of_selfcal(inputs)
+
+    def with_config(self, inputs: Inputs, config: SelfcalConfig) -> Inputs:
+        """Inputs for another configuration, which differs in the model only."""
+        return replace(inputs, config=config)
+
+    def match(self, run: Run) -> Run:
+        """Run with the detections of the same stars, and a first solution."""
+        return match_dithers(run)
+
+    def load_matched(self, run: Run) -> Run:
+        """Run with the detections of an earlier stage."""
+        return load_matched_selfcal(run)
+
+    def fit(self, run: Run) -> Run:
+        """Run with mode and gauge."""
+        return fit_selfcal(run)
+
+    def load_fit(self, run: Run) -> Run:
+        """Run with the fit of an earlier stage and its solution."""
+        return load_selfcal(run)
+
+    def fit_notes(self, run: Run) -> Iterator[tuple[int, str]]:
+        """Sentences about the gauge."""
+        gauge = run.part(SelfCalibrated).gauge
+        for text in gauge.settled:
+            yield logging.INFO, text
+        for text in gauge.unsettled:
+            yield logging.WARNING, text
+
+    def sample(
+        self,
+        run: Run,
+        *,
+        folder: Path | None = None,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> Posterior:
+        """Posterior of the parameters, with the stars eliminated."""
+        return sample_detections(run, folder=folder, progress=progress)
+
+    def questions(self, run: Run) -> Questions:
+        """Residuals are smaller by the degrees of freedom of the stars."""
+        return Questions(
+            centroid=run.errors.by_magnitude,
+            eliminated=run.part(SelfCalibrated).mode,
+        )
+
+    def save_diagnosed(self, run: Run) -> None:
+        """Write the catalogue of the stars."""
+        from bayesdist.kinds.selfcal.stars import write_stars  # needed by one stage
+
+        solved, directory = run.part(SelfCalibrated), run.directory
+        notes = provenance_notes(run.posterior, solved.gauge_words)
+        correlated, compute = run.diagnostics.correlated, run.config.resources()
+        stars = write_stars(directory.path, solved, correlated, notes, compute)
+        directory.summarise(selfcal=directory.summary.get("selfcal", {}) | {"stars": stars})
+
+    def domain(self, run: Run) -> EvaluationDomain:
+        """As of matched stars; exposures overlap partly, which correlates frames with errors."""
+        return replace(super().domain(run), frames=True)
+
+    def null_space(self, run: Run) -> Float | None:
+        """Directions that only the gauge fixes."""
+        return run.part(SelfCalibrated).gauge.null
+
+    def checks(self, run: Run) -> tuple[Check, ...]:
+        """Checks of degeneracies, constraints and detections."""
+        solved = run.part(SelfCalibrated)
+        named = {
+            "Degeneracies": solved.gauge.sentences,
+            "Constraints": solved.contradictions,
+            "Detections": run.match_facts.get("warnings", ()),
+        }
+        # settled by the choice of a gauge, so that they are not a fault of the data
+        settled = set(solved.gauge.settled)
+        return tuple(
+            Check("Gauge", name, level="note" if text in settled else "warn", sentence=text)
+            for name, texts in named.items()
+            for text in texts
+        )
+
+    def report_parts(self, run: Run) -> dict[str, Any]:
+        """Gauge and stars, and the words of a self-calibration."""
+        from bayesdist.kinds.selfcal.report import report_fields  # needed by one stage
+
+        return report_fields(run)
+
+
+SELFCAL = SelfcalKind()
