@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from bayesdist.data.repeated import first_duplicate
 from bayesdist.data.tables.checks import (
     COMPLETED,
+    LARGEST_RHO,
     absent,
     check_values,
     columns_of,
@@ -313,10 +314,10 @@ def _check(
     check_unit(unit, where=where)
     refuse_half(SIGMAS, columns, where=where, what="errors")
     if CORRELATION in columns:
-        beyond = ~(np.abs(columns[CORRELATION]) < 1.0)
+        beyond = ~(np.abs(columns[CORRELATION]) <= LARGEST_RHO)
         if beyond.any() or SIGMAS[0] not in columns:
             raise InputError(
-                "correlations of errors must lie between -1 and 1"
+                f"correlations of errors must lie between -{LARGEST_RHO} and {LARGEST_RHO}"
                 if beyond.any()
                 else "correlations of errors are given, and the errors are not",
                 where=place(int(np.argmax(beyond)), CORRELATION),

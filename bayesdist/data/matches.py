@@ -34,6 +34,7 @@ from bayesdist.data.reading.options import (
 )
 from bayesdist.data.reading.table import match_arguments, sky_table
 from bayesdist.data.repeated import check_same_position, error_codes, star_codes
+from bayesdist.data.tables.checks import LARGEST_RHO
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.quantities import Direction, Epoch, Number, values_in
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
     from astropy.coordinates import SkyCoord
     from astropy.table import QTable
 
+NEGLIGIBLE_RHO = 1e-12  # of rounded numbers
 Errors = MagnitudeErrors | AddedErrors | Number | tuple[ArrayLike, ArrayLike]
 
 
@@ -857,6 +859,46 @@ class Matches(MatchColumns):
         u, v = (np.broadcast_to(values_in(value, self.unit, "sigma"), shape) for value in pair)
         return u, v
 
+    def covariances(self) -> Float:
+        """Covariances of the errors in u and v.
+
+        Returns
+        -------
+        ndarray, shape (N, 2, 2)
+            In `unit` squared.
+
+        Raises
+        ------
+        InputError
+            If the stars are not in memory, or have no errors.
+        """
+        sigma = np.stack([self.column("sigma_u"), self.column("sigma_v")], axis=1)
+        rho = np.zeros(len(self)) if self.rho_uv is None else self.rho_uv
+        out = sigma[:, :, None] * sigma[:, None, :]
+        out[:, 0, 1] *= rho
+        out[:, 1, 0] *= rho
+        return out
+
+    def with_covariances(self, covariance: Float) -> Matches:
+        """These stars with other errors.
+
+        Parameters
+        ----------
+        covariance : ndarray, shape (N, 2, 2)
+            Covariances of the errors in u and v, in `unit` squared.
+
+        Returns
+        -------
+        Matches
+        """
+        sigma = np.sqrt(np.einsum("nii->ni", covariance))
+        rho = np.clip(covariance[:, 0, 1] / sigma.prod(axis=1), -LARGEST_RHO, LARGEST_RHO)
+        return self.with_columns(
+            sigma_u=sigma[:, 0],
+            sigma_v=sigma[:, 1],
+            rho_uv=rho if (np.abs(rho) > NEGLIGIBLE_RHO).any() else None,
+        )
+
     def with_scaled_errors(self, factor: float) -> Matches:
         """These stars with all errors multiplied by a factor.
 
@@ -874,7 +916,7 @@ class Matches(MatchColumns):
             return self.mapped(partial(Matches.with_scaled_errors, factor=factor))
         if self.sigma_u is None or self.sigma_v is None:
             return self
-        return self.with_errors((factor * self.sigma_u, factor * self.sigma_v))
+        return self.with_columns(sigma_u=factor * self.sigma_u, sigma_v=factor * self.sigma_v)
 
     @staticmethod
     def concatenate(tables: Sequence[Matches]) -> Matches:

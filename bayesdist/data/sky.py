@@ -24,6 +24,7 @@ Calabretta & Greisen 2002, A&A 395, 1077, Section 5.1.3, written as standard coo
 
 from __future__ import annotations
 
+from collections.abc import Container, Mapping
 from dataclasses import dataclass
 from itertools import combinations
 from typing import TYPE_CHECKING, Any
@@ -31,7 +32,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bayesdist.data.tables.checks import Place, row_number, zero_motions
+from bayesdist.data.tables.checks import LARGEST_RHO, Place, row_number, zero_motions
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Bool, Float
 
@@ -49,8 +50,8 @@ SPARED = ("parallax", "sigma_parallax", *sorted(CORRELATIONS))
 SKY_QUANTITIES = ("sigma_ra", "sigma_dec", *MOTIONS, *SPARED, "catalogue_epoch")
 # parsecs; without a radial velocity, the path on the sky does not depend on the distance
 _NO_MATTER = 100
+STARS_AT_ONCE = 65_536  # whose correlations are examined
 ROUNDED = 1e-5  # of correlations with few digits: the smallest eigenvalue may be below zero
-LARGEST_RHO = 1 - 1e-6  # of errors that one parameter dominates
 _STANDS = 1e-3  # years; over a shorter time motions are negligible
 _LIGHT = 299_792.458  # km/s
 ARCSEC = np.degrees(1.0) * 3600.0  # seconds of arc in a radian
@@ -122,8 +123,7 @@ def reference_sky(
     """
     ra, dec = sky_columns(quantities)
     _pair(quantities, ("sigma_ra", "sigma_dec"), "arcsec")
-    covariance = _covariance(quantities)
-    sigma, rho = _errors_at(covariance, 0.0, 0.0)
+    sigma, rho = _errors_at(quantities)
     if "catalogue_epoch" in quantities:
         start: Float | None = quantities["catalogue_epoch"].years()
     else:
@@ -155,7 +155,7 @@ def reference_sky(
         factors = _factors(epoch, mean_direction(ra, dec))
         new_ra = new_ra + parallax * factors[0] / 3600 / np.cos(np.radians(new_dec))
         new_dec = new_dec + parallax * factors[1] / 3600
-    sigma, rho = _errors_at(covariance, dt, factors)
+    sigma, rho = _errors_at(quantities, dt, factors)
     step = np.hypot(*motion) * np.abs(dt)
     first, last = float(epoch.min()), float(epoch.max())
     to = f"{first:.2f}" + (f" to {last:.2f}" if last - first > 0.005 else "")
@@ -234,60 +234,89 @@ def _factors(epoch: Float, direction: tuple[float, float]) -> Float:
     return np.asarray(parallax_factors(dates, *direction)[of].T, float)
 
 
-def _covariance(quantities: Quantities) -> Float | None:
-    """Covariances (N, 5, 5) of `PARAMETERS` in arcsec and years; None without errors of positions.
-
-    Missing errors of parallaxes and motions, and missing correlations, count as zero.  InputError
-    for correlations that no covariance has.
-    """
-    if "sigma_ra" not in quantities:
-        return None
-    sigma = np.zeros((len(PARAMETERS), len(quantities)))
-    for k, name in enumerate(PARAMETERS):
-        unit = "arcsec / yr" if name.startswith("pm_") else "arcsec"
-        values = _optional(quantities, f"sigma_{name}", unit)
-        sigma[k] = 0.0 if values is None else values
-    out = np.zeros((len(quantities), len(PARAMETERS), len(PARAMETERS)))
-    out[:] = np.eye(len(PARAMETERS))
-    given = ""
-    for (i, first), (j, second) in combinations(enumerate(PARAMETERS), 2):
-        key = f"corr_{first}_{second}"
-        rho = _optional(quantities, key, "")
-        if rho is None:
-            continue
-        beyond = np.abs(rho) > 1.0
-        if beyond.any():
-            bad = int(np.argmax(beyond))
-            raise quantities[key].fail(bad, f"a correlation is {rho[bad]:g}, and is 1 at most")
-        out[:, i, j] = out[:, j, i] = rho
-        given = key
-    if given:
-        negative = np.linalg.eigvalsh(out)[:, 0] < -ROUNDED
-        if negative.any():
-            raise quantities[given].fail(
-                int(np.argmax(negative)), "the correlations of this star contradict each other"
-            )
-    return np.asarray(out * np.einsum("in,jn->nij", sigma, sigma))
-
-
 def _errors_at(
-    covariance: Float | None, dt: Float | float, factors: Float | float
+    quantities: Quantities, dt: Float | float = 0.0, factors: Float | None = None
 ) -> tuple[Float | None, Float | None]:
     """Errors (2, N) of positions after dt years, and their correlation (N,); None if unknown.
 
-    `covariance` is that of `_covariance`, and `factors` (2, N) are the parallax factors.
+    `factors` (2, N) are the parallax factors; without them nothing moves, and the errors are those
+    of the catalogue.  Missing errors of parallaxes and motions, and missing correlations, count as
+    zero.  InputError for correlations that no covariance has.
     """
-    if covariance is None:
+    if "sigma_ra" not in quantities:
         return None, None
-    A = np.zeros((len(covariance), 2, len(PARAMETERS)))
-    A[:, 0, 0] = A[:, 1, 1] = 1.0
-    A[:, :, 2] = np.transpose(np.broadcast_to(factors, (2, len(covariance))))
-    A[:, 0, 3] = A[:, 1, 4] = dt
-    C = A @ covariance @ np.swapaxes(A, 1, 2)
-    sigma = np.sqrt(np.maximum(np.stack([C[:, 0, 0], C[:, 1, 1]]), np.finfo(float).tiny))
-    if not C[:, 0, 1].any():
-        return sigma, None
-    return sigma, np.clip(C[:, 0, 1] / (sigma[0] * sigma[1]), -LARGEST_RHO, LARGEST_RHO)
+    n = len(quantities)
+    names = ("ra", "dec") if factors is None else PARAMETERS
+    sigma, rho = {}, {}
+    for name in names:
+        unit = "arcsec / yr" if name.startswith("pm_") else "arcsec"
+        values = _optional(quantities, f"sigma_{name}", unit)
+        if values is not None:
+            sigma[name] = values
+    for first, second in combinations(names, 2):
+        values = _optional(quantities, f"corr_{first}_{second}", "")
+        if values is not None and first in sigma and second in sigma:
+            rho[first, second] = _checked(quantities[f"corr_{first}_{second}"], values)
+    shrunk = _shrinkage(quantities, rho, n)
+    # changes of the position to the east and north by a unit of each parameter
+    along: dict[str, tuple[Float | float, Float | float]] = {"ra": (1.0, 0.0), "dec": (0.0, 1.0)}
+    if factors is not None:
+        along |= {"parallax": (factors[0], factors[1]), "pm_ra": (dt, 0.0), "pm_dec": (0.0, dt)}
+    C = np.zeros((3, n))  # uu, uv, vv
+    for name, error in sigma.items():
+        a, b = along[name]
+        for k, weight in enumerate((a * a, a * b, b * b)):
+            C[k] += weight * error**2
+    for (first, second), values in rho.items():
+        (a, b), (c, d) = along[first], along[second]
+        product = shrunk * values * sigma[first] * sigma[second]
+        for k, weight in enumerate((2 * a * c, a * d + b * c, 2 * b * d)):
+            C[k] += weight * product
+    out = np.sqrt(np.maximum(C[[0, 2]], np.finfo(float).tiny))
+    if not states_correlations(quantities.found):
+        return out, None
+    return out, np.clip(C[1] / (out[0] * out[1]), -LARGEST_RHO, LARGEST_RHO)
+
+
+def states_correlations(found: Container[str]) -> bool:
+    """True if errors of positions by these columns are correlated between both axes."""
+    return any(key in found for key in (*CORRELATIONS, "sigma_parallax"))
+
+
+def _checked(column: SourceColumn, rho: Float) -> Float:
+    """Correlations; InputError for one that is larger than 1."""
+    beyond = np.abs(rho) > 1.0
+    if beyond.any():
+        bad = int(np.argmax(beyond))
+        raise column.fail(bad, f"a correlation is {rho[bad]:g}, and is 1 at most")
+    return rho
+
+
+def _shrinkage(
+    quantities: Quantities, rho: Mapping[tuple[str, str], Float], n: int
+) -> Float | float:
+    """Factor (n,) on all correlations of a star that makes them possible; mostly 1.
+
+    Correlations of a part of the pairs may be impossible if the others are zero, as they count.
+    InputError if all are given and contradict each other.
+    """
+    names = sorted({name for pair in rho for name in pair}, key=PARAMETERS.index)
+    if len(rho) < 2:
+        return 1.0
+    out = np.ones(n)
+    for start in range(0, n, STARS_AT_ONCE):
+        rows = slice(start, start + STARS_AT_ONCE)
+        matrices = np.tile(np.eye(len(names)), (len(out[rows]), 1, 1))
+        for (first, second), values in rho.items():
+            i, j = names.index(first), names.index(second)
+            matrices[:, i, j] = matrices[:, j, i] = values[rows]
+        least = np.linalg.eigvalsh(matrices)[:, 0]
+        if len(rho) == len(names) * (len(names) - 1) // 2 and (least < -ROUNDED).any():
+            bad = start + int(np.argmin(least))
+            key = "corr_{}_{}".format(*list(rho)[-1])
+            raise quantities[key].fail(bad, "the correlations of this star contradict each other")
+        out[rows] = 1.0 / np.maximum(1.0 - np.minimum(least, 0.0), 1.0)
+    return out
 
 
 def velocity_aberration(

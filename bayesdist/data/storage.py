@@ -50,7 +50,7 @@ from bayesdist.data.reading.columns import (
 )
 from bayesdist.data.reading.options import ReadArguments, ReadOptions, refuse_missing_errors
 from bayesdist.data.repeated import buckets_for, first_repetition
-from bayesdist.data.sky import CORRELATIONS, direction_of, direction_sum, sky_columns
+from bayesdist.data.sky import direction_of, direction_sum, sky_columns, states_correlations
 from bayesdist.data.tables.checks import columns_of, refuse_half
 from bayesdist.data.tables.column import Quantities, SourceColumn
 from bayesdist.data.tables.parquet import ParquetPart, RowBlock, describe_part
@@ -235,7 +235,8 @@ def _columns_of(file: StoredFile) -> set[str]:
         available.add("epoch")
     if _has_errors(file):
         available |= set(SIGMAS)
-    if "sigma_x" in file.found or ("sigma_ra" in file.found and CORRELATIONS & set(file.found)):
+    correlated = "sigma_ra" in file.found and states_correlations(file.found)
+    if "sigma_x" in file.found or correlated:
         available.add(CORRELATION)
     for on_sky, on_plane in (("pm_ra", "pm"), ("sigma_pm_ra", "sigma_pm")):
         if on_sky in file.found:

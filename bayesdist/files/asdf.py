@@ -196,7 +196,8 @@ def _item_size(datatype: Any) -> float:
         n = math.prod(float(side) for side in _shape(datatype))
         return n * _item_size(datatype.get("datatype"))
     if isinstance(datatype, list) and len(datatype) == 2 and isinstance(datatype[1], int):
-        return float(datatype[1]) * (4 if datatype[0] == "ucs4" else 1)
+        length = float(datatype[1]) if datatype[1] >= 0 else math.inf
+        return length * (4 if datatype[0] == "ucs4" else 1)
     if isinstance(datatype, list):
         return sum(map(_item_size, datatype))
     bits = re.search(r"\d+$", str(datatype))
@@ -209,7 +210,7 @@ def _shape(node: Any) -> list[float]:
         shape = node.get("shape")
         if shape is None:
             return _shape(node.get("data"))
-        return [n for n in shape if isinstance(n, int)]
+        return [n if n >= 0 else math.inf for n in shape if isinstance(n, int)]
     shape = []
     while isinstance(node, list | tuple):
         shape.append(len(node))

@@ -287,3 +287,37 @@ def test_correlations_of_matches_on_a_plane_are_read_and_checked():
     table.remove_columns(["sigma_u", "sigma_v"])
     with pytest.raises(InputError, match="no errors"):
         matches_from_table(table, ReadOptions(unit="arcsec"))
+
+
+def test_some_of_the_correlations_of_valid_stars_are_accepted(rng):
+    """What is not given counts as zero, and need not go together with what is."""
+    sigma, _ = gaia_star(rng, 1)
+    kept = ("ra_dec_corr", "ra_pmra_corr", "dec_pmdec_corr")
+    impossible = 0
+    for k in range(300):
+        _, rho = gaia_star(np.random.default_rng(k), 1)
+        table = gaia_table(np.array([[83.0, -5.0, 2.0, 30.0, -20.0]] * 2), sigma, rho)
+        table.remove_columns([n for n in table.colnames if n.endswith("_corr") and n not in kept])
+        partial = np.where(np.eye(5) == 1, rho, 0.0)
+        for i, j in ((0, 1), (0, 3), (1, 4)):
+            partial[i, j] = partial[j, i] = rho[i, j]
+        impossible += np.linalg.eigvalsh(partial)[0] < 0
+        found = matches_from_table(table, ReadOptions(tangent_point=(83.0, -5.0), epoch=2027.3))
+        assert np.isfinite(found.sigma_u).all() and (np.abs(found.rho_uv) < 1).all()
+    assert impossible > 3
+
+
+def test_batches_without_correlations_are_those_of_one_table(rng, tmp_path, monkeypatch):
+    sigma, rho = gaia_star(rng, 1)
+    table = gaia_table(np.tile([83.0, -5.0, 2.0, 30.0, -20.0], (300, 1)), sigma, rho)
+    table["x"], table["ra"] = np.arange(300) + 1.0, 83.0 + 1e-5 * np.arange(300)
+    for name in [n for n in table.colnames if n.endswith("_corr")]:
+        table[name] = np.where(np.arange(300) < 150, table[name], 0.0)
+    table.write(tmp_path / "gaia.parquet")
+    options = {"tangent_point": (83.0, -5.0), "epoch": 2016.0}
+    whole = matches_from_table(table, ReadOptions(**options))
+    monkeypatch.setattr("bayesdist.data.batches.BATCH", 100)
+    stored = open_matches(tmp_path / "gaia.parquet", **options).load()
+    # parallax factors are those of the middle of a batch
+    np.testing.assert_allclose(stored.rho_uv, whole.rho_uv, atol=1e-3)
+    assert stored.rho_uv[0] != 0

@@ -74,7 +74,18 @@ CATALOGUE_ERRORS_ALONE = (
     "sigma = 'by_magnitude' to estimate them from the residuals"
 )
 _FROM_DETECTIONS = (
-    *("exposure", "chip", "filter", "epoch", "mag", "flux", "colour", "sigma_u", "sigma_v"),
+    *(
+        "exposure",
+        "chip",
+        "filter",
+        "epoch",
+        "mag",
+        "flux",
+        "colour",
+        "sigma_u",
+        "sigma_v",
+        "rho_uv",
+    ),
 )
 _FROM_CATALOGUE = ("ra", "dec", *SKY_QUANTITIES, "mag", "flux", "colour", "star")
 _MARGIN = 0.5  # field radii around the detections in which catalogue stars are used

@@ -12,7 +12,7 @@ import numpy as np
 from bayesdist.data.reading.centroids import with_centroid_errors
 from bayesdist.data.reading.options import ReadOptions
 from bayesdist.data.sky import SKY_QUANTITIES, onto_plane, reference_sky
-from bayesdist.data.tables.checks import refuse_half
+from bayesdist.data.tables.checks import LARGEST_RHO, refuse_half
 from bayesdist.data.tables.column import EncodedColumn, Quantities, SourceColumn, check_unit
 from bayesdist.data.tables.names import ALIASES, PAIRS, find_columns, origin_of
 from bayesdist.errors import InputError
@@ -355,10 +355,10 @@ def _correlation(quantities: Quantities) -> Float:
             do="name their columns, or leave the correlation out",
         )
     rho = column.numbers()
-    beyond = ~(np.abs(rho) < 1.0)
+    beyond = ~(np.abs(rho) <= LARGEST_RHO)
     if beyond.any():
         bad = int(np.argmax(beyond))
-        raise column.fail(bad, f"a correlation is {rho[bad]:g}, and must lie between -1 and 1")
+        raise column.fail(bad, f"a correlation is {rho[bad]:g}, and must be {LARGEST_RHO} at most")
     return rho
 
 

@@ -300,6 +300,13 @@ def groups_of(
     )
 
 
+def _inverses(elements: Float) -> Float:
+    """Inverses (n, 2, 2) of covariances with the elements uu, vv, uv (n, 3)."""
+    uu, vv, uv = elements.T
+    rows = [np.stack([vv, -uv], axis=-1), np.stack([-uv, uu], axis=-1)]
+    return np.asarray(np.stack(rows, axis=-2) / (uu * vv - uv**2)[:, None, None])
+
+
 def noise_of(predictive: Predictive, table: Matches, index: Int) -> Float:
     """Covariance elements uu, vv, uv (n, 3) of stars, without the solution's errors."""
     sigma = np.stack(errors_of(table), axis=1)[index]
@@ -544,10 +551,11 @@ def _frame_sums(
     for name, table, index in _of_exposures(held, list(values)):
         for prediction, by_solution, A in framed(predictive, table, index, values[name]):
             residual, noise = prediction.residual, noise_of(predictive, table, prediction.index)
-            var = noise[:, :2]
-            chi2 = (residual**2 / var).sum(axis=1)
+            weight = _inverses(noise)
+            pull = np.einsum("nab,nb->na", weight, residual)
+            chi2 = (residual * pull).sum(axis=1)
             if soft:
-                score = residual / var / (1 + chi2 / REACH)[:, None]
+                score = pull / (1 + chi2 / REACH)[:, None]
             else:
                 score = scores_of(predictive, residual, noise).place
             # curvature of a Gaussian with the same weights, so that steps never overshoot
@@ -556,7 +564,7 @@ def _frame_sums(
             along = np.einsum("na,nam->nm", score, A)
             gradient, curvature, information, shared = out[name]
             gradient += along.sum(axis=0)
-            curvature += np.einsum("n,na,nam,nak->mk", share, 1 / var, A, A)
+            curvature += np.einsum("n,nab,nam,nbk->mk", share, weight, A, A, optimize=True)
             information += along.T @ along
             shared += along.T @ np.einsum("na,nam->nm", score, by_solution)
             count[name] += len(residual)

@@ -219,7 +219,7 @@ def _refuse_correlated(matches: Matches) -> None:
             "the errors of the matches are correlated between u and v, and errors that stars have "
             "in common are taken as independent on both axes",
             where=", ".join(matches.sources),
-            do="leave the column rho_uv out",
+            do="leave the correlations out (rho_uv, or corr_ra_dec and others)",
         )
 
 

@@ -216,7 +216,6 @@ def in_one_frame(solution: Solution, matches: Matches, chip: int) -> Matches:
     matches = matches.load()
     if len(solution.model.chips) > 1:
         matches = matches.select(matches.chip_number == chip)
-    errors = np.stack([matches.column("sigma_u"), matches.column("sigma_v")], axis=1)
     model, bare = solution.model, without_frames(solution)
     x, y, epoch = matches.x, matches.y, matches.epoch
     predicted = model.predict(
@@ -228,17 +227,8 @@ def in_one_frame(solution: Solution, matches: Matches, chip: int) -> Matches:
     back = np.linalg.inv(frames)[matches.exposure if len(frames) > 1 else 0]
     residual = np.stack([matches.u, matches.v], axis=1) - predicted
     u, v = (alone + np.einsum("...ab,...b->...a", back, residual)).T
-    sigma_u, sigma_v = np.sqrt(np.einsum("...ab,...b->...a", back**2, errors**2)).T
-    return Matches.of_distinct_rows(
-        x=x,
-        y=y,
-        u=u,
-        v=v,
-        unit=matches.unit,
-        sigma_u=sigma_u,
-        sigma_v=sigma_v,
-        chip_numbers=(chip,),
-    )
+    turned = Matches.of_distinct_rows(x=x, y=y, u=u, v=v, unit=matches.unit, chip_numbers=(chip,))
+    return turned.with_covariances(back @ matches.covariances() @ np.swapaxes(back, -1, -2))
 
 
 # -- result of a comparison of polynomial orders: statistics per order, and the selected order -----

@@ -152,7 +152,7 @@ def _constants(posterior: Posterior, matches: Matches) -> Group:
         "outlier_probability": memberships(posterior, matches).outlier_probability,
         "row": matches.row,
     }
-    for name in ("epoch", "mag", "colour"):
+    for name in ("rho_uv", "epoch", "mag", "colour"):
         if getattr(matches, name) is not None:
             columns[name] = getattr(matches, name)
     return Group(

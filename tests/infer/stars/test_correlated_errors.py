@@ -7,6 +7,7 @@ import pytest
 from scipy.special import expit, logsumexp
 from scipy.stats import multivariate_normal
 
+from bayesdist.diagnose.holdout.predictive import frames_for, predictive_of
 from bayesdist.diagnose.score.sample import scored_sample
 from bayesdist.errors import InputError
 from bayesdist.infer import OutlierMixture, fit_linear
@@ -18,6 +19,7 @@ from tests.infer.support import (
     UNCLIPPED,
     legendre_design,
     numerical_gradient,
+    posterior_at,
     residual_of,
     simulated,
     target_of,
@@ -148,11 +150,49 @@ def test_scores_of_single_stars_are_derivatives_with_respect_to_their_position()
 
 
 def test_residuals_in_units_of_their_errors_are_independent():
-    model, matches, _ = correlated(n=20_000)
+    n = 20_000
+    model, matches, _ = correlated(n=n)
     fit = fit_linear(matches, model, **UNCLIPPED)
-    z = scored_sample(matches, fit).whitened
-    covariance = z @ z.T / z.shape[1]
-    np.testing.assert_allclose(covariance, np.eye(2), atol=4 * np.sqrt(2 / 20_000))
+    sample = scored_sample(matches, fit)
+    # correlations are even about zero, and products are compared by their sign
+    sign = np.sign(matches.rho_uv)
+    z, raw = sample.whitened, sample.residual / np.sqrt(sample.variance)
+    np.testing.assert_allclose((z**2).mean(axis=1), 1.0, atol=4 * np.sqrt(2 / n))
+    assert abs(np.mean(sign * z[0] * z[1])) < 4 / np.sqrt(n)
+    assert np.mean(sign * raw[0] * raw[1]) > 0.4
+
+
+def test_errors_are_scaled_and_added_with_their_correlation(rng):
+    _, matches, C = correlated(n=40)
+    np.testing.assert_allclose(matches.covariances(), C)
+    np.testing.assert_allclose(matches.with_scaled_errors(3.0).covariances(), 9 * C)
+    more = matches.with_errors((0.03, 0.04), in_quadrature=True).covariances()
+    np.testing.assert_allclose(more, C + np.diag([0.0009, 0.0016]))
+    np.testing.assert_allclose(matches.with_covariances(2 * C).covariances(), 2 * C)
+    assert matches.with_errors(0.05).rho_uv is None
+
+
+@pytest.mark.parametrize("rho", [-0.97, 0.9])
+@pytest.mark.parametrize("mixture", ["none", "gaussian"])
+def test_the_frame_of_a_held_out_exposure_is_found(rho, mixture):
+    """Steps that take the variances alone diverge."""
+    model, matches, _ = correlated(n=900, frames="shift", n_exposures=2)
+    C, rng = matches.covariances(), np.random.default_rng(5)
+    C[:, 0, 1] = C[:, 1, 0] = rho * matches.sigma_u * matches.sigma_v
+    target, fit = target_of(model, matches, MIXTURES[mixture][0])
+    truth = np.asarray(fit.mean)
+    uv = model.predict(truth, matches.x, matches.y, exposure=matches.exposure)
+    uv += np.einsum("nij,nj->ni", np.linalg.cholesky(C), rng.standard_normal((900, 2)))
+    matches = matches.with_covariances(C).with_columns(u=uv[:, 0], v=uv[:, 1])
+    draws = rng.multivariate_normal(truth, fit.cov, 200)
+    hyper = np.array(MIXTURES[mixture][1])
+    hyper[0] = np.log(1e-3)  # no jitter to speak of
+    rows = np.concatenate([draws, np.tile(hyper, (200, 1))], axis=1)
+    held = matches.select(matches.exposure == 1)
+    held = held.with_columns(exposure=np.zeros(len(held), int), exposure_names=("new",))
+    found = frames_for(predictive_of(posterior_at(target, rows)), held, ("new",))["new"]
+    # the shift of the second exposure, within the errors of some 450 stars
+    np.testing.assert_allclose(found.values, truth[-2:], atol=4 * 0.06 / np.sqrt(450))
 
 
 @pytest.mark.parametrize("rho", [1.0, -1.2, np.nan])

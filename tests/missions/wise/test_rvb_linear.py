@@ -102,10 +102,11 @@ def test_errors_go_through_the_transformation(rng):
     cloud = small(np.array(CENTRE) + rng.standard_normal((200_000, 2)) * (0.05, 0.1))
     after = transformed(pairs(rng), small)
     np.testing.assert_allclose(cloud.std(axis=0), [after.sigma_u[0], after.sigma_v[0]], rtol=0.01)
-    with pytest.raises(
-        InputError, match=r"row 1: the errors of u and v would be correlated by 0\.6"
-    ):
-        transformed(pairs(rng), RvbTransform(0, 0, np.pi / 4))
+    # errors that are unequal become correlated: (0.01 - 0.0025) / (0.01 + 0.0025)
+    half = transformed(pairs(rng), RvbTransform(0, 0, np.pi / 4))
+    np.testing.assert_allclose(np.abs(half.rho_uv), 0.6)
+    cloud = RvbTransform(0, 0, np.pi / 4)(rng.standard_normal((200_000, 2)) * (0.05, 0.1))
+    assert np.corrcoef(cloud.T)[0, 1] == pytest.approx(half.rho_uv[0], abs=0.01)
     # equal errors may be turned by any angle
     assert transformed(pairs(rng, sigma=(0.1, 0.1)), RvbTransform(0, 0, 1.0)).sigma_u[0] == (
         pytest.approx(0.1)

@@ -21,8 +21,6 @@ from bayesdist.utils.arrays import Float, Int
 PARAMETERS = ("shift_u", "shift_v", "rotation", "scale_u", "scale_v", "skew")
 
 # Errors of u and v are uncorrelated in Matches, so that a transformation that would correlate them
-# by more than this is rejected.  A rotation by 0.05 with errors 1 and 1.5 gives 0.04.
-CORRELATED = 0.1
 
 
 @dataclass(frozen=True)
@@ -100,12 +98,7 @@ class RvbTransform:
 
 
 def transformed(matches: Matches, transform: RvbTransform) -> Matches:
-    """Transform the reference positions of pairs and their errors.
-
-    Raises InputError if the errors of u and v would become correlated by more than 0.1, which a
-    table of matches cannot represent.  This occurs for unequal errors and a rotation that is
-    neither small nor close to a right angle.
-    """
+    """Transform the reference positions of pairs and the covariances of their errors."""
     everywhere = np.zeros(len(matches), np.int64)
     return _moved(matches, everywhere, transform.matrix[None], transform.shift[None],
                   np.array([transform.centre]))  # fmt: skip
@@ -176,17 +169,7 @@ def _moved(matches: Matches, code: Int, matrix: Float, shift: Float, centre: Flo
     if matches.u_nominal is not None and matches.v_nominal is not None:
         nominal = moved(matches.u_nominal, matches.v_nominal)
         columns |= dict(zip(("u_nominal", "v_nominal"), nominal, strict=True))
-    if matches.sigma_u is not None and matches.sigma_v is not None:
-        var = np.stack([matches.sigma_u, matches.sigma_v], axis=1) ** 2
-        out = np.sqrt(np.einsum("nij,nj->ni", (matrix**2)[code], var))
-        covariance = np.einsum("nj,nj->n", (matrix[:, 0] * matrix[:, 1])[code], var)
-        correlation = np.abs(covariance / (out[:, 0] * out[:, 1]))
-        if correlation.max() > CORRELATED:
-            worst = int(np.argmax(correlation))
-            raise InputError(
-                f"the errors of u and v would be correlated by {correlation[worst]:.2f}",
-                where=f"{matches.sources[matches.source[worst]]}, row {matches.row[worst] + 1}",
-                do="give both axes the same errors first, or transform the detections instead",
-            )
-        columns |= {"sigma_u": out[:, 0], "sigma_v": out[:, 1]}
+    if matches.sigma_u is not None:
+        M = matrix[code]
+        matches = matches.with_covariances(M @ matches.covariances() @ np.swapaxes(M, 1, 2))
     return matches.with_columns(**columns)
