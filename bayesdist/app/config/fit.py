@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field, PositiveFloat, PositiveInt
 
@@ -35,25 +35,26 @@ class Periods(Section):
     days: PositiveFloat
 
 
-class _Fit(Section):
+class BaseFit(Section):
+    """Linear fit, with the keys that all kinds of runs have."""
+
+    if TYPE_CHECKING:
+
+        @property
+        def radial_weight(self) -> float: ...
+
     clip_chi2: Annotated[float, Field(gt=0, le=1e9)] = 25.0
     clip_abs: Annotated[float, Field(gt=0, le=1e9)] = 2.0
     skew: bool = False
 
 
-class Fit(_Fit):
+class Fit(BaseFit):
     """Linear fit."""
 
     radial_weight: PositiveFloat = 1.0
 
 
-class CampaignFit(_Fit):
-    """Linear fit of a campaign."""
-
-    radial_weight: ClassVar[float] = 1.0
-
-
-class _Outliers(Section):
+class BaseOutliers(Section):
     """Errors in addition to the quoted ones, and the fraction of false matches."""
 
     if TYPE_CHECKING:
@@ -62,6 +63,10 @@ class _Outliers(Section):
         def model(self) -> str: ...
         @property
         def outlier_scale(self) -> float | None: ...
+        @property
+        def match_radius(self) -> float | None: ...
+        @property
+        def jitter_by(self) -> Literal["auto", "one", "chip", "exposure", "filter"]: ...
 
     jitter: Literal["fit"] | Annotated[float, Field(ge=0)] = "fit"
     fraction_prior: Pair = (1.0, 9.0)
@@ -79,29 +84,15 @@ class _Outliers(Section):
         )
 
 
-class SelfcalOutliers(_Outliers):
-    """False detections, which are uniform within the match radius."""
+class MixtureOutliers(BaseOutliers):
+    """Outlier mixture of stars that are matched with a catalogue."""
 
-    match_radius: ClassVar[None] = None
-    outlier_scale: ClassVar[None] = None
-    jitter_by: ClassVar[Literal["auto"]] = "auto"
-
-    model: Literal["uniform"] = "uniform"
-
-
-class _Mixture(_Outliers):
     model: Literal["gaussian", "uniform", "none"] = "gaussian"
     match_radius: PositiveFloat | None = None
     outlier_scale: PositiveFloat | None = None
 
 
-class CampaignOutliers(_Mixture):
-    """Outlier mixture of a campaign."""
-
-    jitter_by: ClassVar[Literal["auto"]] = "auto"
-
-
-class Outliers(_Mixture):
+class Outliers(MixtureOutliers):
     """Outlier mixture, with jitters of groups of stars."""
 
     jitter_by: Literal["auto", "one", "chip", "exposure", "filter"] = "auto"
@@ -115,7 +106,14 @@ class Outliers(_Mixture):
             )
 
 
-class _Sampler(Section):
+class BaseSampler(Section):
+    """Stopping criteria and seed."""
+
+    if TYPE_CHECKING:
+
+        @property
+        def walkers(self) -> int | None: ...
+
     seed: Annotated[int, Field(ge=0)] = 1
     ensembles: Annotated[int, Field(ge=2, le=1000)] = 4
     target_ess: PositiveFloat = 400.0
@@ -124,16 +122,10 @@ class _Sampler(Section):
     checkpoint_every: Annotated[int, Field(ge=1, le=100_000_000)] = 200
 
 
-class Sampler(_Sampler):
+class Sampler(BaseSampler):
     """Stopping criteria, seed and walkers."""
 
     walkers: Annotated[int, Field(ge=1, le=100_000)] | None = None
-
-
-class SelfcalSampler(_Sampler):
-    """Stopping criteria and seed of a self-calibration."""
-
-    walkers: ClassVar[None] = None
 
 
 class ComputeBlock(Section):

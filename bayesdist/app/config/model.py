@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from pydantic import Field, PositiveFloat
 
@@ -13,7 +13,14 @@ from bayesdist.model.basis import MAX_ORDER
 FrameKind = Literal["none", "shift", "shift_rotation", "shift_rotation_scale", "affine"]
 
 
-class _Drift(Section):
+class BaseTdd(Section):
+    """Terms that drift linearly with time, with the keys that all kinds of runs have."""
+
+    if TYPE_CHECKING:
+
+        @property
+        def rates(self) -> str: ...
+
     epoch0: Epoch | list[Epoch]
     terms: list[tuple[Literal["u", "v"], Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]]]
     breaks: list[Epoch] = Field(default_factory=list)
@@ -26,16 +33,10 @@ class _Drift(Section):
         return TimeDependence(tuple(self.terms), tuple(epochs), tuple(self.breaks))
 
 
-class Tdd(_Drift):
+class Tdd(BaseTdd):
     """Terms that drift linearly with time."""
 
     rates: ClassVar[str] = "free"
-
-
-class CampaignTdd(_Drift):
-    """Terms that drift linearly with time, optionally at the rates of another run."""
-
-    rates: str = "free"
 
 
 class Polynomials(Section):
@@ -45,26 +46,21 @@ class Polynomials(Section):
     reference_pixel: Pair | None = None
 
 
-class MatchedModel(Polynomials):
+class StructureBlock(Polynomials):
+    """Structure of the distortion model, with the keys that all kinds of runs have."""
+
+    if TYPE_CHECKING:
+
+        @property
+        def frames(self) -> FrameKind: ...
+        @property
+        def tdd(self) -> BaseTdd | None: ...
+
+
+class MatchedModel(StructureBlock):
     """Structure of the distortion model, with the frames of the exposures."""
 
     frames: FrameKind = "none"
-    tdd: Tdd | None = None
-
-
-class CampaignModel(Polynomials):
-    """Structure of the distortion model; a campaign defines the frames of its exposures itself."""
-
-    frames: ClassVar[Literal["none"]] = "none"
-
-    tdd: CampaignTdd | None = None
-
-
-class SelfcalModel(Polynomials):
-    """Structure of the distortion model; the frames of the exposures are in [selfcal]."""
-
-    frames: ClassVar[Literal["none"]] = "none"
-
     tdd: Tdd | None = None
 
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from datetime import datetime
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, TypeVar
 
 from pydantic import AfterValidator, Field, PositiveFloat, create_model
 
@@ -95,23 +95,30 @@ def _year_of_keyword(text: str) -> float:
     return year_of(date, where="useafter")
 
 
-class _Single(Products):
+P = TypeVar("P", bound=Products)
+
+
+class SingleProducts(Products):
+    """Products of a kind of run that has no releases."""
+
     release: ClassVar[ReleaseBlock | None] = None  # only campaigns have releases
 
 
-class _Release(Products):
-    release: ReleaseBlock | None = None
+def with_formats(*without: str) -> Callable[[type[P]], type[P]]:
+    """Decorator that gives a class of products a section for each format, but not for `without`."""
+
+    def decorated(base: type[P]) -> type[P]:
+        formats = product_settings()
+        fields: dict[str, Any] = {
+            key: (formats[key] | None, None) for key in formats if key not in without
+        }
+        return create_model(
+            base.__name__, __base__=base, __module__=base.__module__, __doc__=base.__doc__, **fields
+        )
+
+    return decorated
 
 
-def _products(name: str, base: type[Products], *without: str) -> Any:
-    """Subclass of `base` with a section for each format, except those in `without`."""
-    formats = product_settings()
-    fields: dict[str, Any] = {
-        key: (formats[key] | None, None) for key in formats if key not in without
-    }
-    return create_model(name, __base__=base, **fields)
-
-
-MatchedProducts = _products("MatchedProducts", _Single)
-CampaignProducts = _products("CampaignProducts", _Release)
-SelfcalProducts = _products("SelfcalProducts", _Single, "wise_meta")
+@with_formats()
+class MatchedProducts(SingleProducts):
+    """Products of matched stars."""

@@ -16,24 +16,18 @@ from bayesdist.app.config.assess import (
     RequirementBlock,
 )
 from bayesdist.app.config.fit import (
-    CampaignFit,
-    CampaignOutliers,
+    BaseFit,
+    BaseOutliers,
+    BaseSampler,
     ComputeBlock,
     DiscrepancyBlock,
-    Fit,
     HoldoutBlock,
-    Outliers,
     Periods,
-    Sampler,
-    SelfcalOutliers,
-    SelfcalSampler,
 )
 from bayesdist.app.config.model import (
-    CampaignModel,
-    MatchedModel,
     PriorBlock,
     PriorCalibrationBlock,
-    SelfcalModel,
+    StructureBlock,
     TablesBlock,
 )
 from bayesdist.app.config.products import Products
@@ -66,16 +60,16 @@ class RunConfig(Section):
     """Sections of every configuration of a run; each kind adds further sections."""
 
     if TYPE_CHECKING:
-        model: MatchedModel | CampaignModel | SelfcalModel
-        outliers: Outliers | CampaignOutliers | SelfcalOutliers
-        sampler: Sampler | SelfcalSampler
+        model: StructureBlock
+        outliers: BaseOutliers
+        sampler: BaseSampler
         products: Products
 
         @property
         def tables(self) -> TablesBlock: ...
 
         @property
-        def fit(self) -> Fit | CampaignFit: ...
+        def fit(self) -> BaseFit: ...
 
         @property
         def periods(self) -> Periods | None: ...

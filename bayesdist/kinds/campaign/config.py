@@ -9,14 +9,14 @@ from typing import ClassVar, Literal
 from pydantic import PositiveFloat
 
 from bayesdist.app.config.fit import (
-    CampaignFit,
-    CampaignOutliers,
+    BaseFit,
     ComputeBlock,
     HoldoutBlock,
+    MixtureOutliers,
     Sampler,
 )
-from bayesdist.app.config.model import CampaignModel, PriorBlock, TablesBlock
-from bayesdist.app.config.products import CampaignProducts
+from bayesdist.app.config.model import BaseTdd, PriorBlock, StructureBlock, TablesBlock
+from bayesdist.app.config.products import Products, ReleaseBlock, with_formats
 from bayesdist.app.config.run import FREE, RunConfig, rates_file, tables_file
 from bayesdist.app.config.section import Epoch, Unit
 from bayesdist.kinds.star_lists import StarListsBlock
@@ -36,6 +36,39 @@ class CampaignBlock(StarListsBlock):
     radius: PositiveFloat | None = None
     pm_selection: Literal["reliable", "all"] = "reliable"
     vafactor_source: Literal["log", "earth"] = "log"
+
+
+class CampaignTdd(BaseTdd):
+    """Terms that drift linearly with time, optionally at the rates of another run."""
+
+    rates: str = "free"
+
+
+class CampaignModel(StructureBlock):
+    """Structure of the distortion model; a campaign defines the frames of its exposures itself."""
+
+    frames: ClassVar[Literal["none"]] = "none"
+
+    tdd: CampaignTdd | None = None
+
+
+class CampaignFit(BaseFit):
+    """Linear fit of a campaign."""
+
+    radial_weight: ClassVar[float] = 1.0
+
+
+class CampaignOutliers(MixtureOutliers):
+    """Outlier mixture of a campaign."""
+
+    jitter_by: ClassVar[Literal["auto"]] = "auto"
+
+
+@with_formats()
+class CampaignProducts(Products):
+    """Products of a campaign, with a release for several filters."""
+
+    release: ReleaseBlock | None = None
 
 
 class CampaignConfig(RunConfig):

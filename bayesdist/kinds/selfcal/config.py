@@ -9,9 +9,9 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field, PositiveFloat
 
 from bayesdist.app.config.data import names_nominal
-from bayesdist.app.config.fit import ComputeBlock, Fit, SelfcalOutliers, SelfcalSampler
-from bayesdist.app.config.model import PriorBlock, SelfcalModel, TablesBlock
-from bayesdist.app.config.products import SelfcalProducts
+from bayesdist.app.config.fit import BaseOutliers, BaseSampler, ComputeBlock, Fit
+from bayesdist.app.config.model import PriorBlock, StructureBlock, TablesBlock, Tdd
+from bayesdist.app.config.products import SingleProducts, with_formats
 from bayesdist.app.config.run import POSTERIOR, RunConfig
 from bayesdist.app.config.section import Epoch, Section, Unit
 from bayesdist.infer import OutlierMixture
@@ -90,6 +90,35 @@ class GaugeBlock(Section):
                     f"gauge.{key} is given without gauge.offsets; name the file of the commanded "
                     f"offsets, or leave {key} out"
                 )
+
+
+class SelfcalModel(StructureBlock):
+    """Structure of the distortion model; the frames of the exposures are in [selfcal]."""
+
+    frames: ClassVar[Literal["none"]] = "none"
+
+    tdd: Tdd | None = None
+
+
+class SelfcalOutliers(BaseOutliers):
+    """False detections, which are uniform within the match radius."""
+
+    match_radius: ClassVar[None] = None
+    outlier_scale: ClassVar[None] = None
+    jitter_by: ClassVar[Literal["auto"]] = "auto"
+
+    model: Literal["uniform"] = "uniform"
+
+
+class SelfcalSampler(BaseSampler):
+    """Stopping criteria and seed of a self-calibration."""
+
+    walkers: ClassVar[None] = None
+
+
+@with_formats("wise_meta")
+class SelfcalProducts(SingleProducts):
+    """Products of a self-calibration."""
 
 
 class SelfcalConfig(RunConfig):
