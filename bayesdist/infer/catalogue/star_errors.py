@@ -216,8 +216,8 @@ def _refuse_correlated(matches: Matches) -> None:
     """Raise InputError for matches whose errors are correlated between u and v."""
     if matches.rho_uv is not None and matches.rho_uv.any():
         raise InputError(
-            "the errors of the matches are correlated between u and v, and errors that stars have "
-            "in common are taken as independent on both axes",
+            "the errors of the matches are correlated between u and v, and errors shared by all "
+            "matches of a star are taken as independent on both axes",
             where=", ".join(matches.sources),
             do="leave the correlations out (rho_uv, or corr_ra_dec and others)",
         )
