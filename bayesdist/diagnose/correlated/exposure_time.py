@@ -27,8 +27,8 @@ FARTHEST = 4.0
 # relative to the time between first and last exposure
 CORRELATION_TIMES = np.array([0.05, 0.15, 0.4, 1.0])
 UNCORRELATED = 0.5  # prior probability that deviations are independent
-# p-value below which correlation times are considered: few exposures hardly show a correlation, which
-# makes the errors of their drift too small all the same
+# p-value below which correlation times are considered: few exposures hardly show a correlation,
+# which makes the errors of their drift too small all the same
 SUSPECTED = 0.5
 
 
