@@ -344,7 +344,7 @@ DEFECTS = [
     (copy_chip, "warning", "DX,1, DX,2: the same values"),
     (lambda h: drop(h, "INSTRUME"), "error", "INSTRUME: is missing"),
     (lambda h: drop(h, "USEAFTER"), "note", "USEAFTER: is missing"),
-    (lose("SIGMA_DX", 1), "", ""),
+    (lose("SIGMA_DX", 1), "warning", "SIGMA_DY has no SIGMA_DX beside it"),
     (lambda h: h["SIGMA_DX", 2].data.__imul__(-1.0), "warning", "SIGMA_DX,2: some sigmas"),
 ]  # fmt: skip
 

@@ -254,6 +254,13 @@ def _sigma(file: LookupFile) -> Iterator[Finding]:
             "some sigmas are negative or not finite",
             "the shape is not that of the table",
         )
+    for chip in file.chips:
+        given = {p.name for p in file.sigma_planes if p.chip == chip}
+        if len(given) == 1:
+            [name], wanted = given, {f"SIGMA_{axis}" for axis in AXES}
+            [missing] = wanted - given
+            text = f"{name} has no {missing} beside it, and the errors of the chip are not read"
+            yield Finding("warning", f"chip {chip}", text)
 
 
 def _names(planes: list[Plane]) -> str:
