@@ -201,7 +201,7 @@ def test_scatters_follow_from_deviations_as_bayes_theorem_has_it():
 def effect_of_deviations(mode):
     """Rms over the detector of the polynomials' response to deviations of unit scatter."""
     even = EvenStars.of(mode)
-    columns = AddedColumns(even.problem, mode.theta, {}, even.deviations)
+    columns = AddedColumns(even.problem, mode.theta, {}, even.deviating())
     scores = scores_of_detections(mode).at(even.rows)
     information, _, _ = eliminated(columns, scores, even.stars)
     n, model = len(mode.theta), mode.problem.model
