@@ -19,6 +19,8 @@ from bayesdist.data.columns import (
     SIGMAS,
     Labels,
     MatchColumns,
+    covariances_of,
+    errors_of,
     joined_arguments,
     joined_columns,
     merged_counts,
@@ -34,7 +36,6 @@ from bayesdist.data.reading.options import (
 )
 from bayesdist.data.reading.table import match_arguments, sky_table
 from bayesdist.data.repeated import check_same_position, error_codes, star_codes
-from bayesdist.data.tables.checks import LARGEST_RHO
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.quantities import Direction, Epoch, Number, values_in
@@ -872,12 +873,8 @@ class Matches(MatchColumns):
         InputError
             If the stars are not in memory, or have no errors.
         """
-        sigma = np.stack([self.column("sigma_u"), self.column("sigma_v")], axis=1)
-        rho = np.zeros(len(self)) if self.rho_uv is None else self.rho_uv
-        out = sigma[:, :, None] * sigma[:, None, :]
-        out[:, 0, 1] *= rho
-        out[:, 1, 0] *= rho
-        return out
+        rho = 0.0 if self.rho_uv is None else self.rho_uv
+        return covariances_of(self.column("sigma_u"), self.column("sigma_v"), rho)
 
     def with_covariances(self, covariance: Float) -> Matches:
         """These stars with other errors.
@@ -891,13 +888,10 @@ class Matches(MatchColumns):
         -------
         Matches
         """
-        sigma = np.sqrt(np.einsum("nii->ni", covariance))
-        rho = np.clip(covariance[:, 0, 1] / sigma.prod(axis=1), -LARGEST_RHO, LARGEST_RHO)
-        return self.with_columns(
-            sigma_u=sigma[:, 0],
-            sigma_v=sigma[:, 1],
-            rho_uv=rho if (np.abs(rho) > NEGLIGIBLE_RHO).any() else None,
-        )
+        errors: dict[str, Any] = errors_of(covariance)
+        if (np.abs(errors["rho_uv"]) <= NEGLIGIBLE_RHO).all():
+            errors["rho_uv"] = None
+        return self.with_columns(**errors)
 
     def with_scaled_errors(self, factor: float) -> Matches:
         """These stars with all errors multiplied by a factor.

@@ -32,6 +32,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from bayesdist.data.columns import covariances_of, errors_of
 from bayesdist.data.tables.checks import LARGEST_RHO, Place, row_number, zero_motions
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Bool, Float
@@ -122,8 +123,6 @@ def reference_sky(
     Raises InputError for half a pair, and for missing or invalid units.
     """
     ra, dec = sky_columns(quantities)
-    _pair(quantities, ("sigma_ra", "sigma_dec"), "arcsec")
-    sigma, rho = _errors_at(quantities)
     if "catalogue_epoch" in quantities:
         start: Float | None = quantities["catalogue_epoch"].years()
     else:
@@ -131,7 +130,7 @@ def reference_sky(
     moves = epoch is not None and start is not None
     motion = _pair(quantities, ("pm_ra", "pm_dec"), "arcsec / yr", missing=not moves)
     if motion is None:
-        return ReferenceSky(ra, dec, sigma, rho, None, None, ())
+        return ReferenceSky(ra, dec, *_errors_at(quantities), None, None, ())
     sigma_motion = _pair(
         quantities, ("sigma_pm_ra", "sigma_pm_dec"), "arcsec / yr", missing=not moves
     )
@@ -139,7 +138,7 @@ def reference_sky(
         lacks = "the epoch of the exposures" if epoch is None else "the epoch of the catalogue"
         key = "data.epoch" if epoch is None else "data.catalogue_epoch"
         note = f"proper motions are not used: {lacks} is not given ({key})"
-        return ReferenceSky(ra, dec, sigma, rho, motion, sigma_motion, (note,))
+        return ReferenceSky(ra, dec, *_errors_at(quantities), motion, sigma_motion, (note,))
     zero = zero_motions(quantities["pm_ra"].values, quantities["pm_dec"].values)
     if zero.any():  # tables on disk: rows are not left out in reading
         raise quantities["pm_ra"].fail(
@@ -243,12 +242,13 @@ def _errors_at(
     of the catalogue.  Missing errors of parallaxes and motions, and missing correlations, count as
     zero.  InputError for correlations that no covariance has.
     """
-    if "sigma_ra" not in quantities:
+    positions = _pair(quantities, ("sigma_ra", "sigma_dec"), "arcsec")
+    if positions is None:
         return None, None
     n = len(quantities)
     names = ("ra", "dec") if factors is None else PARAMETERS
-    sigma, rho = {}, {}
-    for name in names:
+    sigma, rho = dict(zip(("ra", "dec"), positions, strict=True)), {}
+    for name in names[2:]:
         unit = "arcsec / yr" if name.startswith("pm_") else "arcsec"
         values = _optional(quantities, f"sigma_{name}", unit)
         if values is not None:
@@ -257,7 +257,7 @@ def _errors_at(
         values = _optional(quantities, f"corr_{first}_{second}", "")
         if values is not None and first in sigma and second in sigma:
             rho[first, second] = _checked(quantities[f"corr_{first}_{second}"], values)
-    shrunk = _shrinkage(quantities, rho, n)
+    shrinkage = _shrinkage(quantities, rho, n)
     # changes of the position to the east and north by a unit of each parameter
     along: dict[str, tuple[Float | float, Float | float]] = {"ra": (1.0, 0.0), "dec": (0.0, 1.0)}
     if factors is not None:
@@ -269,7 +269,7 @@ def _errors_at(
             C[k] += weight * error**2
     for (first, second), values in rho.items():
         (a, b), (c, d) = along[first], along[second]
-        product = shrunk * values * sigma[first] * sigma[second]
+        product = shrinkage * values * sigma[first] * sigma[second]
         for k, weight in enumerate((2 * a * c, a * d + b * c, 2 * b * d)):
             C[k] += weight * product
     out = np.sqrt(np.maximum(C[[0, 2]], np.finfo(float).tiny))
@@ -558,15 +558,9 @@ def onto_plane(
     for name, errors in (("sigma", sigma), ("sigma_pm", sigma_motion)):
         if errors is not None:
             variance = np.einsum("nij,jn->in", J**2, errors**2)
-            if name == "sigma" and rho is not None:
-                mixed = 2 * rho * errors[0] * errors[1]
-                variance += np.einsum("ni,ni,n->in", J[:, :, 0], J[:, :, 1], mixed)
             out[f"{name}_u"], out[f"{name}_v"] = np.sqrt(variance)
     if sigma is not None and rho is not None:
-        mixed = J[:, 0, 0] * J[:, 1, 0] * sigma[0] ** 2 + J[:, 0, 1] * J[:, 1, 1] * sigma[1] ** 2
-        across = J[:, 0, 0] * J[:, 1, 1] + J[:, 0, 1] * J[:, 1, 0]
-        mixed += across * rho * sigma[0] * sigma[1]
-        out["rho_uv"] = mixed / (out["sigma_u"] * out["sigma_v"])
+        out |= errors_of(J @ covariances_of(sigma[0], sigma[1], rho) @ np.swapaxes(J, 1, 2))
     return out
 
 

@@ -8,27 +8,24 @@ which is used for the matching only.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.polynomial.legendre import legvander
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
+from bayesdist.data.robust import robust_fit
 from bayesdist.utils.arrays import Bool, Float, Int
 
 CONVINCING_PAIRS = 15  # number of pairs that is convincing even if most stars have none
 NARROW = 0.25  # mean spacings of reference stars; final search radius of a linear map
 _MAX_PROBES = 20_000  # largest number of displaced detections that sample chance matches
 _DIRECTIONS = np.exp(2j * np.pi * np.arange(8) / 8)
-Solution = TypeVar("Solution")
 MAX_SAMPLE = 20_000  # largest number of detections used in an iteration
 _FIRST_SAMPLE = 150  # detections in the first round
 _MAX_ROUNDS = 25
 MIN_PAIRS = 6  # with fewer pairs, a linear map fits their noise
-_CLIP = 3.0  # median distances; 3.5 sigma of a circular normal distribution
 _ORDER = 3
 _POWERS = [(i, j) for i in range(_ORDER + 1) for j in range(_ORDER + 1 - i)]
 _MIN_PAIRS_ON_CHIP = 20 * len(_POWERS)  # with fewer pairs on a chip, a cubic fits their noise
@@ -230,46 +227,6 @@ def iterated_map(
             break
         reach, size = max(radius, 0.6 * reach), 3 * size
     return current
-
-
-class RobustFit(NamedTuple, Generic[Solution]):
-    """A fit, the distances (N,) of all pairs from it, and a mask (N,) of the pairs near it."""
-
-    solution: Solution
-    away: Float
-    use: Bool
-
-
-def robust_fit(
-    fit: Callable[[Bool], tuple[Solution, Float] | None],
-    n: int,
-    *,
-    least: int,
-    rounds: int = 5,
-    slack: float = 0.0,
-    reach: float = np.inf,
-) -> RobustFit[Solution] | None:
-    """Fit N pairs repeatedly, rejecting pairs beyond three median distances, until none changes.
-
-    `fit` takes a mask (N,) of pairs and returns the solution and the distances (N,) of all pairs
-    from it, or None if the pairs do not determine it.  The result is None in that case, and if
-    there are fewer than `least` pairs.  There are at most `rounds` fits.  `slack` is the rounding
-    error of a distance of zero; pairs beyond `reach` are not used.
-    """
-    robust, use = None, np.ones(n, bool)
-    for _ in range(rounds):
-        if use.sum() < least:
-            break
-        fitted = fit(use)
-        if fitted is None:
-            return None
-        solution, away = fitted
-        near = away <= min(_CLIP * float(np.median(away[use])) + slack, reach)
-        robust = RobustFit(solution, away, near)
-        if (near == use).all():
-            break
-        use = near
-    return robust
 
 
 def _robust_linear(p: Float, q: Float) -> tuple[Float, Float] | None:

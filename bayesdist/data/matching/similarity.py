@@ -25,8 +25,8 @@ from bayesdist.data.matching.pairs import (
     hull_of,
     iterated_map,
     mean_spacing,
-    robust_fit,
 )
+from bayesdist.data.robust import robust_fit
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Bool, Complex, Float, Int
 

@@ -40,7 +40,7 @@ KINDS = {
     "shear": ("affine",),
 }
 # deviations that are not linear; they are only tested
-SECOND_ORDER = "second order"
+QUADRATIC = "second order"
 # parameters of linear deviations, except for shifts
 LINEAR = {
     "rotation": ("rotation",),
@@ -48,13 +48,13 @@ LINEAR = {
     "shear": ("shear_plus", "shear_cross"),
 }
 # number of coefficients of each kind
-COEFFICIENTS = {"shift": 2, SECOND_ORDER: 6} | {kind: len(names) for kind, names in LINEAR.items()}
+COEFFICIENTS = {"shift": 2, QUADRATIC: 6} | {kind: len(names) for kind, names in LINEAR.items()}
 SCATTERS = {
     "shift": "shift",
     "rotation": "rotation",
     "scale": "shape",
     "shear": "shape",
-    SECOND_ORDER: SECOND_ORDER,
+    QUADRATIC: QUADRATIC,
 }
 CURVATURE = "curvature"
 # largest number of estimated deviations of exposures (6 of each exposure without frames, 3 if shift
@@ -78,21 +78,21 @@ NEGLIGIBLE = 1e-3  # density relative to the maximum
 
 @dataclass(frozen=True, eq=False)
 class DeviationsInTime:
-    """Draws of the deviations of exposures, of which some have deviations correlated in time."""
+    """Posterior draws of the deviations of all exposures and of their correlation time."""
 
     epoch: Float  # (E,) dates of the exposures, decimal years
-    coefficients: Float  # (n, E, q) of the exposures, in the order of the kinds
-    time: Float  # (n,) correlation time of each draw in years; 0 for independent exposures
+    coefficients: Float  # (n, E, q) deviations of the exposures, in the order of their kinds
+    time: Float  # (n,) correlation times in years; 0 in draws with independent exposures
 
     def at(self, epoch: float) -> tuple[Float, Float]:
-        """Conditional distribution of the deviations of an exposure at another date.
+        """Normal distribution of the deviations of an exposure at another date, for each draw.
 
         Returns
         -------
         mean : ndarray, shape (n, q)
-            Expected deviations, given those of the exposures.
+            Mean of the deviations, conditional on those of the other exposures.
         width : ndarray, shape (n,)
-            Standard deviation about the mean, relative to the scatter of the exposures.
+            Standard deviation, relative to the scatter of the exposures.
         """
         mean = np.zeros(self.coefficients[:, 0].shape)
         width = np.ones(len(self.time))
@@ -132,7 +132,7 @@ class LinearDeviations:
     correlation_time: float = 0.0
     # rms of the curvature over detector and dates, minus lines in time, both axes together
     bend: float = 0.0
-    # deviations of the exposures, if they may be correlated in time
+    # None if the deviations are independent in all draws
     in_time: DeviationsInTime | None = None
 
     @property
@@ -158,8 +158,8 @@ class LinearDeviations:
     ) -> Float:
         """Coefficients (n, 2, K) on a chip (by number) of the deviation of a future exposure.
 
-        The deviations deform the polynomials of the parameters `mean` (D,).  If those of the
-        exposures are correlated in time, they tell that of an exposure at the date `epoch`.
+        The deviations deform the polynomials of the parameters `mean` (D,).  If the deviations of
+        exposures are correlated in time, those at the date `epoch` follow in part from the others.
         """
         code, n = self.model.chip_code(chip), len(self.theta)
         at = np.array([self.model.time.epoch0[0] if self.model.time else 0.0])
@@ -264,7 +264,7 @@ def deviation_columns(
     n_all = n_exposures = len(distinct)
     kinds = tuple(k for k, fitted in KINDS.items() if model.frames not in fitted)
     if second_order:
-        kinds = (*kinds, SECOND_ORDER)
+        kinds = (*kinds, QUADRATIC)
     if n_all < 2 or not exposures:
         kinds = ()
     chosen = np.arange(n_all)
@@ -629,7 +629,7 @@ def _deviations(position: Float, kinds: Sequence[str], size: float) -> Float:
     for kind in kinds:
         if kind == "shift":
             chosen.append(np.broadcast_to(size * np.eye(2), (len(position), 2, 2)))
-        elif kind == SECOND_ORDER:
+        elif kind == QUADRATIC:
             X, Y = position.T / size
             terms = size * np.stack([X**2, X * Y, Y**2], axis=1)
             chosen.append(np.einsum("ck,ab->cakb", terms, np.eye(2)).reshape(len(position), 6, 2))

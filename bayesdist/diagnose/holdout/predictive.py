@@ -300,13 +300,6 @@ def groups_of(
     )
 
 
-def _inverses(elements: Float) -> Float:
-    """Inverses (n, 2, 2) of covariances with the elements uu, vv, uv (n, 3)."""
-    uu, vv, uv = elements.T
-    rows = [np.stack([vv, -uv], axis=-1), np.stack([-uv, uu], axis=-1)]
-    return np.asarray(np.stack(rows, axis=-2) / (uu * vv - uv**2)[:, None, None])
-
-
 def noise_of(predictive: Predictive, table: Matches, index: Int) -> Float:
     """Covariance elements uu, vv, uv (n, 3) of stars, without the solution's errors."""
     sigma = np.stack(errors_of(table), axis=1)[index]
@@ -551,7 +544,8 @@ def _frame_sums(
     for name, table, index in _of_exposures(held, list(values)):
         for prediction, by_solution, A in framed(predictive, table, index, values[name]):
             residual, noise = prediction.residual, noise_of(predictive, table, prediction.index)
-            weight = _inverses(noise)
+            # covariances from their elements uu, vv, uv
+            weight = np.linalg.inv(noise[:, [[0, 2], [2, 1]]])
             pull = np.einsum("nab,nb->na", weight, residual)
             chi2 = (residual * pull).sum(axis=1)
             if soft:

@@ -168,7 +168,8 @@ def error_scale(fit: LinearFit, table: Matches) -> float:
     false.  `table` contains the matches or a part of them.
     """
     stars, _ = prepare(fit.model, table)
-    quantile = np.quantile(stars.chi2(np.asarray(fit.mean)), LOW_QUANTILE)
+    residual = stars.residuals_along_axes(np.asarray(fit.mean))
+    quantile = np.quantile(stars.chi2(residual), LOW_QUANTILE)
     factor = float(np.sqrt(quantile / chi2_ppf(LOW_QUANTILE, 2)))
     return 1.0 if QUOTED_ERRORS.met_by(factor) else factor
 

@@ -235,8 +235,8 @@ def _causes(significant: Mapping[str, Family], outcomes: Sequence[Outcome]) -> d
         if name in significant
         and not all(explains_more(by_name[name], result) for result in competitors)
     }
-    if any(leaves_much(by_name["pointing"], result) for result in single if "pointing" in by_name):
-        weaker.add("pointing")
+    if "pointing" in significant:
+        weaker |= {"pointing" for result in single if leaves_much(by_name["pointing"], result)}
     # Terms of a missing order contain steps and rings that are smaller than the terms themselves,
     # whereas polynomials follow a true step or ring only in part.
     # The robust fit includes the next orders.

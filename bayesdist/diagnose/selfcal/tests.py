@@ -26,7 +26,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.sparse import csr_array
 
-from bayesdist.diagnose.correlated.deviations import SECOND_ORDER as SECOND_ORDER_KIND
+from bayesdist.diagnose.correlated.deviations import QUADRATIC
 from bayesdist.diagnose.residuals.misfit import Misfit, bin_means, partitions_for, worst_misfit
 from bayesdist.diagnose.score.exposures import EXPOSURES, SECOND_ORDER
 from bayesdist.diagnose.score.missing_orders import chip_residuals
@@ -109,7 +109,7 @@ class _AddedColumns(AddedColumns):
         if self.deviations is None:
             return np.zeros(0, int)
         n = self.deviations.n_of_exposures
-        chosen = (self.deviations.scatter[:n] == SECOND_ORDER_KIND) == second_order
+        chosen = (self.deviations.scatter[:n] == QUADRATIC) == second_order
         first = 2 * self.n_functions(0) * len(self.problem.model.chips)
         return first + np.flatnonzero(chosen)
 

@@ -424,7 +424,7 @@ def _some_residuals(stars: Stars, theta: Float, every: int) -> tuple[Float, ...]
 
 def _some_chi2(stars: Stars, theta: Float, every: int) -> tuple[Float, ...]:
     """Chi-square (sum over both axes) of every `every`-th star."""
-    return (stars.chi2(theta)[::every],)
+    return (stars.chi2(stars.residuals_along_axes(theta))[::every],)
 
 
 @takes(solution=Solution, matches=Matches)

@@ -400,8 +400,9 @@ class Clip:
 
     def keeps_of(self, stars: Stars) -> Bool:
         """Boolean mask (N,) that is True for prepared stars within both limits."""
-        r2 = (stars.residuals(self.theta) ** 2).sum(axis=1)
-        return np.asarray((stars.chi2(self.theta) <= self.chi2_limit) & (r2 <= self.abs_limit**2))
+        residual = stars.residuals_along_axes(self.theta)
+        r2 = (residual**2).sum(axis=1)
+        return np.asarray((stars.chi2(residual) <= self.chi2_limit) & (r2 <= self.abs_limit**2))
 
 
 @dataclass(frozen=True, eq=False)

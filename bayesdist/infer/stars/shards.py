@@ -397,7 +397,7 @@ def survey(stars: Stars, matches: Matches, every: int) -> Survey:
             : len(model.exposures)
         ],
         chips=tuple(chips),
-        variance=tuple(v[::every].copy() for v in stars.covariances()[0::2]),
+        variance=tuple(variance[::every].copy() for variance in stars.variances()),
         sources=matches.sources,
         farthest=_farthest(matches),
     )

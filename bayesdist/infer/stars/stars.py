@@ -111,10 +111,9 @@ class Stars:
         """Residuals (N, 2) along the principal axes of the errors."""
         return kernel.residuals(self.blocks, self.columns, self.powers(theta), self.model.order)
 
-    def chi2(self, theta: Float) -> Float:
-        """Chi-square (N,) of the stars, both axes together, with the quoted errors."""
-        r = self.residuals_along_axes(theta)
-        return np.asarray(r[:, 0] ** 2 / self.var_u + r[:, 1] ** 2 / self.var_v)
+    def chi2(self, along_axes: Float) -> Float:
+        """Chi-square (N,) of residuals (N, 2) along the principal axes, with the quoted errors."""
+        return np.asarray(along_axes[:, 0] ** 2 / self.var_u + along_axes[:, 1] ** 2 / self.var_v)
 
     def off_axes(self, vectors: Float) -> Float:
         """Turn vectors (2, N) from the principal axes of the errors to u and v."""
@@ -141,12 +140,19 @@ class Stars:
         """Stars with the same errors in u and in v, taken as independent."""
         if not self.is_correlated:
             return self
-        var_u, _, var_v = self.covariances()
+        var_u, var_v = self.variances()
         u, v = self.off_axes(np.stack([self.u, self.v]))
         off: dict[str, Any] = {}
         if self.off_u is not None and self.off_v is not None:
             off = dict(zip(("off_u", "off_v"), self.off_axes(np.stack(self.offsets)), strict=True))
         return replace(self, u=u, v=v, var_u=var_u, var_v=var_v, cos=NONE, sin=NONE, **off)
+
+    def variances(self) -> tuple[Float, Float]:
+        """Squared quoted errors (N,) in u and in v."""
+        if not self.is_correlated:
+            return self.var_u, self.var_v
+        var_u, _, var_v = self.covariances()
+        return var_u, var_v
 
     def covariances(self, added: float = 0.0) -> Float:
         """Covariances uu, uv, vv (3, N) of the quoted errors, plus a variance `added` per axis."""
