@@ -134,3 +134,10 @@ def test_errors_in_another_unit_are_refused(rng):
     table["x_err"].unit = "arcsec"
     with pytest.raises(InputError, match="errors of pixels are in pix"):
         matches_from_table(table, ReadOptions(unit="arcsec"))
+
+
+def test_matches_on_a_line_do_not_say_how_large_a_pixel_is(rng):
+    table = stars(rng, x_err=np.full(N, 0.02), y_err=np.full(N, 0.02))
+    table["y"] = 2 * table["x"]
+    with pytest.raises(InputError, match="400 matches do not determine the size of a pixel"):
+        matches_from_table(table, ReadOptions(unit="arcsec"))
