@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.data.covariances import LARGEST_RHO
 from bayesdist.data.repeated import first_duplicate
 from bayesdist.data.tables.checks import (
     COMPLETED,
-    LARGEST_RHO,
     absent,
     check_values,
     columns_of,
@@ -46,20 +46,6 @@ _INTEGERS = ("row", "source", "star", *LABELS_OF_CODES)
 _NUMBERS = (*POSITIONS, *SIGMAS, *OPTIONAL)
 COLUMNS = (*_NUMBERS, *_INTEGERS)
 Columns = Mapping[str, NDArray[Any]]
-
-
-def covariances_of(sigma_u: Float, sigma_v: Float, rho: Float | float) -> Float:
-    """Covariances (N, 2, 2) of errors in u and v with their correlations."""
-    mixed = rho * sigma_u * sigma_v
-    rows = [np.stack([sigma_u**2, mixed], axis=-1), np.stack([mixed, sigma_v**2], axis=-1)]
-    return np.stack(rows, axis=-2)
-
-
-def errors_of(covariance: Float) -> dict[str, Float]:
-    """Columns sigma_u, sigma_v and rho_uv of covariances (N, 2, 2)."""
-    sigma_u, sigma_v = np.sqrt(np.einsum("nii->in", covariance))
-    rho = np.clip(covariance[:, 0, 1] / (sigma_u * sigma_v), -LARGEST_RHO, LARGEST_RHO)
-    return {"sigma_u": sigma_u, "sigma_v": sigma_v, "rho_uv": rho}
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,13 +19,12 @@ from bayesdist.data.columns import (
     SIGMAS,
     Labels,
     MatchColumns,
-    covariances_of,
-    errors_of,
     joined_arguments,
     joined_columns,
     merged_counts,
     refuse_repeated,
 )
+from bayesdist.data.covariances import covariances_of, errors_of
 from bayesdist.data.magnitude_errors import AddedErrors, MagnitudeErrors, no_magnitudes
 from bayesdist.data.output import arrow_stream, html_of, table_of
 from bayesdist.data.reading.options import (

@@ -32,8 +32,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bayesdist.data.columns import covariances_of, errors_of
-from bayesdist.data.tables.checks import LARGEST_RHO, Place, row_number, zero_motions
+from bayesdist.data.covariances import LARGEST_RHO, covariances_of, errors_of
+from bayesdist.data.tables.checks import Place, row_number, zero_motions
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Bool, Float
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from bayesdist.data.columns import covariances_of, errors_of
+from bayesdist.data.covariances import covariances_of, errors_of
 from bayesdist.data.robust import robust_fit
 from bayesdist.data.tables.column import Quantities, SourceColumn
 from bayesdist.errors import InputError

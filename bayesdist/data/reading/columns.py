@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from bayesdist.data.covariances import LARGEST_RHO
 from bayesdist.data.reading.centroids import with_centroid_errors
 from bayesdist.data.reading.options import ReadOptions
 from bayesdist.data.sky import SKY_QUANTITIES, onto_plane, reference_sky
-from bayesdist.data.tables.checks import LARGEST_RHO, refuse_half
+from bayesdist.data.tables.checks import refuse_half
 from bayesdist.data.tables.column import EncodedColumn, Quantities, SourceColumn, check_unit
 from bayesdist.data.tables.names import ALIASES, PAIRS, find_columns, origin_of
 from bayesdist.errors import InputError

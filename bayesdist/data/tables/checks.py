@@ -19,7 +19,6 @@ ZERO_MOTION = "proper motion of exactly 0"
 NOT_FINITE = ("refuse", "reject")
 # limits for a value and for an error, so that the ratio of their squares can be represented
 LARGEST, SMALLEST = 1e30, 1e-100
-LARGEST_RHO = 0.999999  # correlation of errors; beyond, weights lose their digits
 Place = Callable[[int], str]  # name of a row in error messages, given its index in the arrays
 # default of columns that a class fills in itself, so that they are never None afterwards
 COMPLETED: Any = None

@@ -1,0 +1,26 @@
+"""Covariances of errors in u and v, as matrices and as columns.
+
+This module imports little, because sky positions of single files need it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bayesdist.utils.arrays import Float
+
+LARGEST_RHO = 0.999999  # correlation of errors; beyond, weights lose their digits
+
+
+def covariances_of(sigma_u: Float, sigma_v: Float, rho: Float | float) -> Float:
+    """Covariances (N, 2, 2) of errors in u and v with their correlations."""
+    mixed = rho * sigma_u * sigma_v
+    rows = [np.stack([sigma_u**2, mixed], axis=-1), np.stack([mixed, sigma_v**2], axis=-1)]
+    return np.stack(rows, axis=-2)
+
+
+def errors_of(covariance: Float) -> dict[str, Float]:
+    """Columns sigma_u, sigma_v and rho_uv of covariances (N, 2, 2)."""
+    sigma_u, sigma_v = np.sqrt(np.einsum("nii->in", covariance))
+    rho = np.clip(covariance[:, 0, 1] / (sigma_u * sigma_v), -LARGEST_RHO, LARGEST_RHO)
+    return {"sigma_u": sigma_u, "sigma_v": sigma_v, "rho_uv": rho}
