@@ -37,9 +37,10 @@ from bayesdist.infer.solution.linear import LinearFit
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.infer.stars.stars import Stars, prepare
 from bayesdist.model import DistortionModel, Groups
-from bayesdist.utils.arrays import Float, Int
+from bayesdist.utils.arrays import Bool, Float, Int
 
 SCRATCH = 64_000_000  # bytes of sums that are computed at a time
+ROUNDING = 1e-9  # relative, of variances
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,13 +54,17 @@ class StarErrors:
     motion : ndarray, shape (S, 2), optional
         Standard errors of the proper motions along u and v, in the unit of u, v per year.
     epoch : ndarray, shape (S,), optional
-        Dates (decimal years) at which the errors of position and proper motion are uncorrelated;
-        required with `motion`.
+        Dates (decimal years) of the positions; required with `motion`. Without `correlations`, the
+        errors of position and proper motion are uncorrelated at this date.
+    correlations : ndarray, shape (S, 2, 2) or (S, 4, 4), optional
+        Correlation matrices of the errors in u and v and, with `motion`, of the proper motions in u
+        and v. By default all errors are independent.
     """
 
     position: Float
     motion: Float | None = None
     epoch: Float | None = None
+    correlations: Float | None = None
 
     def levers(self, star: Int, epoch: Float | None) -> Float:
         """Derivatives of matched positions with respect to catalogue position and proper motion.
@@ -84,8 +89,36 @@ class StarErrors:
     @property
     def variances(self) -> Float:
         """Variances (1 or 2, S, 2) of the positions and, if given, of the proper motions."""
-        parts = [self.position] if self.motion is None else [self.position, self.motion]
-        return np.asarray(np.stack(parts) ** 2)
+        return np.asarray(np.stack(self._sigmas) ** 2)
+
+    @property
+    def _sigmas(self) -> list[Float]:
+        """Standard errors (S, 2) of the positions and, if given, of the proper motions."""
+        return [self.position] if self.motion is None else [self.position, self.motion]
+
+    def covariances(self, star: Int, n_levers: int) -> Float:
+        """Covariances (n, levers, 2, levers, 2) of positions and, with two levers, of motions.
+
+        The second and the last axis are the lever (see `levers`), the others u and v.  `star` (n,)
+        are star codes.
+        """
+        sigma = np.stack([values[star] for values in self._sigmas[:n_levers]], axis=1)
+        m = 2 * n_levers
+        if self.correlations is None:
+            out = np.broadcast_to(np.eye(m), (len(star), m, m))
+        else:
+            out = self.correlations[star, :m, :m]
+        out = out.reshape(len(star), n_levers, 2, n_levers, 2)
+        return np.asarray(out * sigma[:, :, :, None, None] * sigma[:, None, None])
+
+    def covariances_at(self, star: Int, epoch: Float | None) -> Float:
+        """Covariances (n, 2, 2) of the catalogue positions at the dates of the matches.
+
+        The arguments are those of `at`.
+        """
+        levers = self.levers(star, epoch)
+        covariances = self.covariances(star, len(levers))
+        return np.asarray(np.einsum("ln,nlamb,mn->nab", levers, covariances, levers))
 
     def at(self, star: Int, epoch: Float | None) -> Float:
         """Variances of the catalogue positions at the dates of the matches.
@@ -101,6 +134,8 @@ class StarErrors:
         -------
         ndarray, shape (n, 2)
         """
+        if self.correlations is not None:
+            return np.einsum("naa->na", self.covariances_at(star, epoch))
         levers = self.levers(star, epoch)
         variances = self.variances[: len(levers), star]
         return np.asarray(np.einsum("ln,lna->na", levers**2, variances))
@@ -108,16 +143,17 @@ class StarErrors:
     def checked(self, n_stars: int) -> StarErrors:
         """Errors of the first `n_stars` stars, validated.
 
-        Raises InputError if there are fewer stars, values are not finite or negative, or the epoch
-        is missing.
+        Raises InputError if there are fewer stars, values are not finite or negative, correlations
+        are impossible, or the epoch is missing.
         """
         position = _checked(self.position, n_stars, "position")
         if self.motion is None or not self.motion.any():
-            return StarErrors(position)
+            return StarErrors(position, correlations=_possible(self.correlations, n_stars, 2))
         if self.epoch is None:
             raise InputError("errors of proper motions need the catalogue's epoch", do="give it")
         motion = _checked(self.motion, n_stars, "motion")
-        return StarErrors(position, motion, _checked(self.epoch, n_stars, "epoch", signed=True))
+        epoch = _checked(self.epoch, n_stars, "epoch", signed=True)
+        return StarErrors(position, motion, epoch, _possible(self.correlations, n_stars, 4))
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +168,8 @@ class StarCovariance:
         Part that the covariance of the solution already includes, because it treats the errors of
         all matches as independent.
     motions : ndarray, shape (D, D), optional
-        Part of `total` caused by the errors of the proper motions; None if they have no errors.
+        Part of `total` caused by the errors of the proper motions, and by what the errors of the
+        positions have in common with them; None if proper motions have no errors.
     """
 
     total: Float
@@ -194,17 +231,19 @@ def star_covariance(
     if errors.motion is not None and matches.epoch is None:
         raise InputError("errors of proper motions need the epochs of the matches")
     levers, variances = errors.levers(code, matches.epoch), errors.variances
-    _require_contained(matches, code, variances, levers)
-    _refuse_correlated(matches)
+    _require_contained(matches, code, errors)
     stars, order = prepare(solution.model, matches)
     used = solution.uses(matches)[order]
-    inverse = np.stack([used / stars.var_u, used / stars.var_v])
-    sums = StarSums.of(stars, code[order], inverse, list(levers[:, order]))
+    sums = StarSums.weighted(stars, code[order], list(levers[:, order]), used.astype(float))
     cov, mean = np.asarray(solution.cov, float), np.asarray(solution.mean)
     D = solution.model.n_params if frames else solution.model.n_distortion
     influence = influence_by_group(solution.model, mean, stars.groups, cov, D)
-    parts = sums.shared(influence, list(variances), scratch)
-    counted = sums.independent(influence, list(variances))
+    if errors.correlations is None:
+        parts = sums.shared(influence, list(variances), scratch)
+        counted = sums.independent(influence, list(variances))
+    else:
+        parts = sums.shared_correlated(influence, errors, scratch)
+        counted = sums.counted(influence, errors.covariances_at(code, matches.epoch)[order])
     if not frames:
         follow = np.linalg.solve(cov[:D, :D], cov[:D]).T
         parts, counted = (follow @ c @ follow.T for c in (parts, counted))
@@ -212,31 +251,50 @@ def star_covariance(
     return StarCovariance(sum(motions, positions), (counted + counted.T) / 2, *motions)
 
 
-def _refuse_correlated(matches: Matches) -> None:
-    """Raise InputError for matches whose errors are correlated between u and v."""
-    if matches.rho_uv is not None and matches.rho_uv.any():
+def _require_contained(matches: Matches, code: Int, errors: StarErrors) -> None:
+    """Raise InputError if quoted errors are smaller than the catalogue errors, on any direction."""
+    if matches.sigma_u is None or matches.sigma_v is None:
+        return  # `prepare` refuses these
+    if matches.rho_uv is None and errors.correlations is None:
+        part = errors.at(code, matches.epoch)
+        for axis, quoted in enumerate((matches.sigma_u, matches.sigma_v)):
+            _refuse_small(quoted**2 < part[:, axis] * (1 - ROUNDING), "sigma_" + "uv"[axis])
+        return
+    quoted = matches.covariances()
+    least = np.linalg.eigvalsh(quoted - errors.covariances_at(code, matches.epoch))[:, 0]
+    _refuse_small(least < -ROUNDING * np.einsum("naa->n", quoted), "sigma_u, sigma_v, rho_uv")
+
+
+def _refuse_small(small: Bool, where: str) -> None:
+    if small.any():
         raise InputError(
-            "the errors of the matches are correlated between u and v, and errors shared by all "
-            "matches of a star are taken as independent on both axes",
-            where=", ".join(matches.sources),
-            do="leave the correlations out (rho_uv, or corr_ra_dec and others)",
+            f"the quoted errors of {int(small.sum())} matches are smaller than the error of "
+            "their star in the catalogue",
+            where=where,
+            do="add the catalogue's errors to them",
         )
 
 
-def _require_contained(matches: Matches, code: Int, variances: Float, levers: Float) -> None:
-    """Raise InputError if quoted errors are smaller than the catalogue errors."""
-    for axis, quoted in enumerate((matches.sigma_u, matches.sigma_v)):
-        if quoted is None:
-            continue  # `prepare` refuses these
-        part = sum(lever**2 * v[code, axis] for lever, v in zip(levers, variances, strict=True))
-        small = quoted**2 < part * (1 - 1e-9)
-        if small.any():
-            raise InputError(
-                f"the quoted errors of {int(small.sum())} matches are smaller than the error of "
-                "their star in the catalogue",
-                where="sigma_" + "uv"[axis],
-                do="add the catalogue's errors to them",
-            )
+def _possible(correlations: Float | None, n_stars: int, n: int) -> Float | None:
+    """Correlation matrices (n_stars, n, n) of the first parameters; InputError if impossible."""
+    if correlations is None:
+        return None
+    if len(correlations) < n_stars or min(correlations.shape[1:]) < n:
+        raise InputError(
+            f"correlations have shape {correlations.shape}, and {n_stars} stars need "
+            f"{(n_stars, n, n)}",
+            where="correlations",
+            do="give a matrix for each star",
+        )
+    out = np.asarray(correlations[:n_stars, :n, :n], float)
+    unit = np.isclose(np.einsum("naa->na", out), 1.0, rtol=0.0, atol=ROUNDING)
+    if not np.isfinite(out).all() or not unit.all() or np.linalg.eigvalsh(out).min() < -1e-5:
+        raise InputError(
+            "some matrices are not correlation matrices",
+            where="correlations",
+            do="give 1 on the diagonal, and no negative eigenvalue",
+        )
+    return out
 
 
 def _checked(values: Float, n_stars: int, name: str, *, signed: bool = False) -> Float:
@@ -280,9 +338,14 @@ class StarInfluence:
         common = np.flatnonzero(self.codes[at] == star)
         star, at = star[common], at[common]
         levers = self.errors.levers(star, None if epoch is None else epoch[common])
+        by = self.by[: len(levers)][:, :, at]
+        if self.errors.correlations is not None:
+            covariances = self.errors.covariances(star, len(levers))
+            out[common] = np.einsum("ln,nlamb,mbnd->nad", levers, covariances, by, optimize=True)
+            return out
         variances = self.errors.variances[: len(levers), star]
         weight = levers[..., None] * variances  # (levers, n, 2)
-        out[common] = np.einsum("lna,land->nad", weight, self.by[: len(levers)][:, :, at])
+        out[common] = np.einsum("lna,land->nad", weight, by)
         return out
 
 
@@ -297,7 +360,6 @@ def star_influence(
     """
     code = matches.column("star")
     model, D = fit.model, fit.model.n_distortion
-    _refuse_correlated(matches)
     n_levers = 1 if errors.motion is None else 2
     by = np.zeros((n_levers, 2, len(codes), D))
     wanted = np.isin(code, codes) & fit.uses(matches)
@@ -307,8 +369,7 @@ def star_influence(
     star = code[wanted][order]
     epoch = None if matches.epoch is None else matches.epoch[wanted][order]
     levers = list(errors.levers(star, epoch))
-    inverse = np.stack([1 / stars.var_u, 1 / stars.var_v])
-    sums = StarSums.of(stars, np.searchsorted(codes, star), inverse, levers)
+    sums = StarSums.weighted(stars, np.searchsorted(codes, star), levers)
     influence = influence_by_group(model, fit.mean, stars.groups, fit.cov, D)
     by[: len(levers)] = sums.each(influence, 0, len(codes))
     return StarInfluence(errors, codes, by)
@@ -337,6 +398,12 @@ def influence_by_group(
     return out
 
 
+def _summed(sums: Float, covariances: Float) -> Float:
+    """Sum (D, D) over stars of products of sums (n, m, D) with covariances (n, m, m)."""
+    flat = sums.reshape(-1, sums.shape[2])
+    return np.asarray(flat.T @ (covariances @ sums).reshape(flat.shape))
+
+
 @dataclass(frozen=True, eq=False)
 class StarSums:
     """Matches sorted by group, and by star within each group."""
@@ -348,6 +415,7 @@ class StarSums:
     # derivatives (N,) of the match's position with respect to an error of the star: 1 for its
     # position and, if proper motions have errors, years
     levers: list[Float]
+    order: Int  # index (N,) of each match in the stars that it was taken from
     cross: Float | None = None  # off-diagonal weight (N,) between u and v
 
     @classmethod
@@ -381,8 +449,19 @@ class StarSums:
             phi,
             weight[:, order],
             [lever[order] for lever in levers],
+            order,
             None if cross is None else cross[order],
         )
+
+    @classmethod
+    def weighted(
+        cls, stars: Stars, code: Int, levers: list[Float], used: Float | float = 1.0
+    ) -> StarSums:
+        """Sums with weights `used` (N,) times the inverse covariances of the matches."""
+        if not stars.is_correlated:
+            return cls.of(stars, code, np.stack([used / stars.var_u, used / stars.var_v]), levers)
+        uu, uv, vv = stars.matrices_off_axes(used / stars.var_u, 0.0, used / stars.var_v)
+        return cls.of(stars, code, np.stack([uu, vv]), levers, uv)
 
     def each(self, influence: list[Float], first: int, end: int) -> Float:
         """Sums (levers, 2, end - first, D) for the stars from `first` to `end`, by lever and axis.
@@ -428,6 +507,50 @@ class StarSums:
                     part = sums[c, axis]
                     part *= np.sqrt(variance[first : first + step, axis])[:, None]
                     out[c] += part.T @ part
+        return out
+
+    def shared_correlated(
+        self, influence: list[Float], errors: StarErrors, scratch: int = SCRATCH
+    ) -> Float:
+        """Covariances (levers, D, D) from correlated errors that the matches of a star share.
+
+        With two levers the second is that of the motions, and of what the positions have in common
+        with them: the first is that of the positions at the date when both are uncorrelated.
+        Stars are processed in chunks, as in `shared`.
+        """
+        D, n_stars, n_levers = influence[0].shape[2], len(errors.position), len(self.levers)
+        out = np.zeros((n_levers, D, D))
+        step = max(1, scratch // (32 * D * n_levers))
+        for first in range(0, n_stars, step):
+            codes = np.arange(first, min(first + step, n_stars))
+            sums = self.each(influence, first, first + len(codes))
+            flat = np.moveaxis(sums, 2, 0).reshape(len(codes), 2 * n_levers, D)
+            total = errors.covariances(codes, n_levers).reshape(-1, 2 * n_levers, 2 * n_levers)
+            positions, mixed = total[:, :2, :2], total[:, :2, 2:]
+            if n_levers == 2:
+                gain = mixed @ np.linalg.pinv(total[:, 2:, 2:], hermitian=True)
+                positions = positions - gain @ np.swapaxes(mixed, 1, 2)
+                out[1] += _summed(flat, total)
+            out[0] += _summed(flat[:, :2], positions)
+        out[1:] -= out[0]
+        return out
+
+    def counted(self, influence: list[Float], covariances: Float) -> Float:
+        """Covariance (D, D) from errors of the matches with covariances (N, 2, 2), if independent.
+
+        `covariances` are in the order of the stars that the sums were made of.
+        """
+        D = influence[0].shape[2]
+        out = np.zeros((D, D))
+        for g, phi in enumerate(self.phi):
+            rows = slice(self.starts[g], self.starts[g + 1])
+            W = np.empty((len(phi), 2, 2))
+            W[:, 0, 0], W[:, 1, 1] = self.weight[:, rows]
+            W[:, 0, 1] = W[:, 1, 0] = 0.0 if self.cross is None else self.cross[rows]
+            products = W @ covariances[self.order[rows]] @ W
+            for a, b in ((0, 0), (0, 1), (1, 0), (1, 1)):
+                moment = (phi * products[:, a, b, None]).T @ phi
+                out += influence[g][a].T @ moment @ influence[g][b]
         return out
 
     def independent(self, influence: list[Float], variances: list[Float]) -> Float:

@@ -393,5 +393,15 @@ def with_star_errors_of(
         star_influence(fit, table, errors, codes).by
         for fit, table in (released, (new.fit, matches))
     )
-    variances = errors.variances[: len(old), codes]
-    return replace(out, common=np.einsum("lasd,lsa,lasn->dn", old, variances, now[..., :n]))
+    covariances = errors.covariances(codes, len(old))
+    return replace(out, common=_common(old, covariances, now[..., :n]))
+
+
+def _common(old: Float, covariances: Float, new: Float) -> Float:
+    """Covariance (D, n) of parameters that depend on the errors of the same stars.
+
+    `old` (levers, 2, stars, D) and `new` (levers, 2, stars, n) are the derivatives of two solutions
+    with respect to these errors, whose covariances are (stars, levers, 2, levers, 2).
+    """
+    moved = np.einsum("slamb,mbsn->lasn", covariances, new)
+    return np.asarray(np.einsum("lasd,lasn->dn", old, moved))

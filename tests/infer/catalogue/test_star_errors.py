@@ -12,7 +12,7 @@ from threadpoolctl import threadpool_limits
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer import GaussianPriors, Rejection, fit_linear
-from bayesdist.infer.catalogue.star_errors import StarErrors, star_covariance
+from bayesdist.infer.catalogue.star_errors import StarErrors, star_covariance, star_influence
 from bayesdist.infer.exposures.hierarchy import fit_hierarchical
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.infer.solution.transforms import linear_terms, reference_gauge
@@ -48,15 +48,103 @@ def some(seed=1, n_stars=70):
             for a in (0, 1)
         )
     )
+    return model, matches.with_columns(star=code), fitted(matches, model), code, catalogue
+
+
+def fitted(matches, model):
+    """Fit that leaves some matches out, with priors of the exposures' scales and shears."""
     named = {
         f"{e}.{kind}": (0.0, 1e-5)
         for e in model.exposures
         for kind in ("scale", "shear_plus", "shear_cross")
     }
-    fit = fit_linear(
-        matches, model, priors=GaussianPriors.of(model, named), rejection=Rejection(clip_chi2=4.0)
-    )
-    return model, matches.with_columns(star=code), fit, code, catalogue
+    priors = GaussianPriors.of(model, named)
+    return fit_linear(matches, model, priors=priors, rejection=Rejection(clip_chi2=4.0))
+
+
+def correlated(seed=1):
+    """The same, with correlations of positions and motions, and of the remaining errors."""
+    model, matches, _, code, catalogue = some(seed)
+    rng = np.random.default_rng([seed, 46])
+    root = rng.standard_normal((len(catalogue.position), 4, 4))
+    cov = root @ np.swapaxes(root, 1, 2)
+    size = 1 / np.sqrt(np.einsum("nii->ni", cov))
+    catalogue = replace(catalogue, correlations=cov * size[:, :, None] * size[:, None])
+    S = joint_covariances(catalogue)[code]
+    A = np.zeros((len(code), 2, 4))
+    A[:, [0, 1], [0, 1]] = 1.0
+    A[:, [0, 1], [2, 3]] = (matches.epoch - catalogue.epoch[code])[:, None]
+    root = rng.normal(0.0, 0.03, (len(code), 2, 2))
+    own = root @ np.swapaxes(root, 1, 2) + 1e-4 * np.eye(2)
+    matches = matches.with_covariances(A @ S @ np.swapaxes(A, 1, 2) + own)
+    return matches, fitted(matches, model), code, catalogue, A
+
+
+def joint_covariances(catalogue):
+    """Covariances (S, 4, 4) of u, v and the motions in both."""
+    sigma = np.hstack([catalogue.position, catalogue.motion])
+    return catalogue.correlations * sigma[:, :, None] * sigma[:, None]
+
+
+def dense_correlated(fit, matches, code, S, A, weight):
+    """The covariance of all matches' catalogue errors (S of stars), carried through the fit."""
+    J = fit.model.jacobian(fit.mean, matches.x, matches.y, **columns_of(matches))
+    W = weight[:, None, None] * np.linalg.inv(matches.covariances())
+    response = np.einsum("pq,naq,nab->pnb", fit.cov, J, W)
+    by_star = np.zeros((len(fit.cov), len(S), 4))
+    np.add.at(by_star.transpose(1, 0, 2), code, np.einsum("pnb,nbk->npk", response, A))
+    total = np.einsum("psk,skl,qsl->pq", by_star, S, by_star)
+    each = A @ S[code] @ np.swapaxes(A, 1, 2)
+    return total, np.einsum("pna,nab,qnb->pq", response, each, response)
+
+
+@pytest.mark.parametrize("scratch", [64_000_000, 32 * 100 * 14])
+def test_with_correlations_it_is_the_dense_formula(scratch):
+    matches, fit, code, catalogue, A = correlated()
+    used = fit.uses(matches)
+    found = star_covariance(fit, matches.with_columns(star=code), catalogue, scratch=scratch)
+    S = joint_covariances(catalogue)
+    total, counted = dense_correlated(fit, matches, code, S, A, used.astype(float))
+    unit = np.sqrt(np.outer(np.diag(total), np.diag(total)))
+    np.testing.assert_allclose(found.total / unit, total / unit, atol=1e-9)
+    np.testing.assert_allclose(found.counted / unit, counted / unit, atol=1e-9)
+    # positions as they were at the date when they and the motions were independent
+    still = S.copy()
+    still[:, :2, :2] -= S[:, :2, 2:] @ np.linalg.solve(S[:, 2:, 2:], S[:, 2:, :2])
+    still[:, 2:] = still[:, :, 2:] = 0.0
+    alone, _ = dense_correlated(fit, matches, code, still, A, used.astype(float))
+    np.testing.assert_allclose((found.total - found.motions) / unit, alone / unit, atol=1e-9)
+    assert np.linalg.eigvalsh(found.motions / unit).min() > -1e-9
+
+
+def test_the_influence_of_stars_has_their_correlations():
+    """Of stars in another exposure: sum of Sigma_s (H^-1 G_s)^T over positions and motions."""
+    matches, fit, code, catalogue, A = correlated(2)
+    codes = np.unique(code)[::2]
+    found = star_influence(fit, matches.with_columns(star=code), catalogue, codes)
+    J = fit.model.jacobian(fit.mean, matches.x, matches.y, **columns_of(matches))
+    W = fit.uses(matches)[:, None, None] * np.linalg.inv(matches.covariances())
+    response = np.einsum("pq,naq,nab,nbk->npk", fit.cov, J, W, A)
+    D, S = fit.model.n_distortion, joint_covariances(catalogue)
+    for star, epoch in ((codes[3], 2001.5), (codes[5], 2009.0)):
+        G = response[code == star].sum(axis=0)[:D]
+        lever = epoch - catalogue.epoch[star]
+        expected = np.hstack([np.eye(2), lever * np.eye(2)]) @ S[star] @ G.T
+        given = found.with_solution(np.array([star]), np.array([epoch]))[0]
+        np.testing.assert_allclose(given, expected, atol=1e-9 * np.abs(expected).max())
+
+
+def test_impossible_correlations_are_refused():
+    matches, fit, code, catalogue, _ = correlated()
+    matches = matches.with_columns(star=code)
+    for wrong in (2 * catalogue.correlations, np.ones((70, 4, 4)) - 2 * np.eye(4)):
+        with pytest.raises(InputError, match="correlation matrices"):
+            star_covariance(fit, matches, replace(catalogue, correlations=wrong))
+    with pytest.raises(InputError, match="shape"):
+        star_covariance(fit, matches, replace(catalogue, correlations=np.ones((70, 2, 2))))
+    turned = matches.with_columns(rho_uv=-matches.rho_uv)
+    with pytest.raises(InputError, match="smaller than the error"):
+        star_covariance(fit, turned, catalogue)
 
 
 def dense(fit, matches, code, catalogue, weight):

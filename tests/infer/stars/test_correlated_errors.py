@@ -11,7 +11,6 @@ from bayesdist.diagnose.holdout.predictive import frames_for, predictive_of
 from bayesdist.diagnose.score.sample import scored_sample
 from bayesdist.errors import InputError
 from bayesdist.infer import OutlierMixture, fit_linear
-from bayesdist.infer.catalogue.star_errors import StarErrors, star_covariance
 from bayesdist.infer.stars.likelihood import MixtureAt
 from bayesdist.infer.stars.stars import prepare
 from tests.infer.support import (
@@ -200,11 +199,3 @@ def test_impossible_correlations_are_refused(rho):
     _, matches, _ = correlated(n=20)
     with pytest.raises(InputError, match="rho_uv"):
         matches.with_columns(rho_uv=np.full(20, rho))
-
-
-def test_errors_that_stars_share_refuse_correlations():
-    model, matches, _ = correlated(n=100)
-    fit = fit_linear(matches, model)
-    matches = matches.with_columns(star=np.arange(100))
-    with pytest.raises(InputError, match="correlated between u and v"):
-        star_covariance(fit, matches, StarErrors(np.full((100, 2), 1e-3)))
