@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -10,9 +10,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.data.covariances import LARGEST_RHO, with_correlations, without_sizes
 from bayesdist.data.reading.columns import is_on_sky, plane_unit, position_unit
 from bayesdist.data.reading.table import as_table, with_sky_columns
-from bayesdist.data.sky import onto_plane, parallax_factors, sky_columns
+from bayesdist.data.sky import (
+    CORRELATIONS,
+    PARAMETERS,
+    correlation_matrices,
+    onto_plane,
+    parallax_factors,
+    sky_columns,
+    tangent_jacobian,
+)
 from bayesdist.data.tables.checks import (
     COMPLETED,
     check_columns,
@@ -31,6 +40,8 @@ from bayesdist.utils.quantities import Direction, Epoch, direction_in, year_of
 _PAIRS = (("sigma_u", "sigma_v"), ("pm_u", "pm_v"), ("sigma_pm_u", "sigma_pm_v"))
 _PARALLAX = ("parallax", "sigma_parallax")
 _COLUMNS = ("u", "v", "mag", *(name for pair in _PAIRS for name in pair), *_PARALLAX)
+# errors of the parameters that `ReferenceCatalog.correlations` are of, in their order
+_SIGMAS = ("sigma_u", "sigma_v", "sigma_parallax", "sigma_pm_u", "sigma_pm_v")
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,12 +77,15 @@ class ReferenceCatalog:
         unknown.
     notes : tuple of str
         Clauses on how the stars of the file were treated.
+    correlations : ndarray, shape (N, 5, 5), optional
+        Correlation matrices of the errors of u, v, parallax, pm_u and pm_v. By default all errors
+        are independent.
 
     Raises
     ------
     InputError
         If there are no stars, if lengths are unequal, if values are not finite, if errors or codes
-        are negative, or if only one of a pair of columns is given.
+        are negative, if only one of a pair of columns is given, or if correlations are impossible.
 
     Examples
     --------
@@ -97,6 +111,7 @@ class ReferenceCatalog:
     parallax: Float | None = None
     sigma_parallax: Float | None = None
     notes: tuple[str, ...] = ()
+    correlations: Float | None = None
 
     def __post_init__(self) -> None:
         check_unit(self.unit, where=self.source)
@@ -126,9 +141,73 @@ class ReferenceCatalog:
                 where=self.source,
                 do="give decimal years",
             )
+        if self.correlations is not None:
+            self._check_correlations(np.asarray(self.correlations, float))
+
+    def _check_correlations(self, correlations: Float) -> None:
+        if self.sigma_u is None:
+            raise InputError(
+                "has correlations of errors but no errors",
+                where=self.source,
+                do="give sigma_u and sigma_v, or leave the correlations out",
+            )
+        n = (len(self), len(_SIGMAS), len(_SIGMAS))
+        possible = correlations.shape == n and np.isfinite(correlations).all()
+        if not possible or (np.abs(correlations) > 1.0).any():
+            raise InputError(
+                f"correlations are not {n[0]} matrices of 5 x 5 numbers from -1 to 1",
+                where=self.source,
+                do="give a correlation matrix of u, v, parallax, pm_u and pm_v for each star",
+            )
+        object.__setattr__(self, "correlations", np.ascontiguousarray(correlations))
 
     def __len__(self) -> int:
         return len(self.u)
+
+    @property
+    def covariances(self) -> Float:
+        """Covariances (N, 5, 5) of the errors of u, v, parallax, pm_u and pm_v; 0 if unknown."""
+        sigma = np.zeros((len(self), len(_SIGMAS)))
+        for k, name in enumerate(_SIGMAS):
+            values = getattr(self, name)
+            if values is not None:
+                sigma[:, k] = values
+        correlations = self.correlations
+        if correlations is None:
+            correlations = np.broadcast_to(np.eye(len(_SIGMAS)), (len(self), 5, 5))
+        return with_correlations(sigma, correlations)
+
+    def _with_covariances(self, covariances: Float, **changes: Any) -> ReferenceCatalog:
+        """Catalogue with these covariances (N, 5, 5) of its errors, and with other changes."""
+        sigma, correlations = without_sizes(covariances)
+        sigmas = {
+            name: sigma[:, k] for k, name in enumerate(_SIGMAS) if getattr(self, name) is not None
+        }
+        return replace(self, **{**sigmas, "correlations": correlations, **changes})
+
+    def with_errors_of(self, covariances: Float, jacobian: Float) -> ReferenceCatalog:
+        """Catalogue with the errors of other axes.
+
+        `covariances` (N, 5, 5) are those of position, parallax and motion along other axes, and
+        `jacobian` (N, 2, 2) the derivatives of u and v with respect to these.
+        """
+        turn = np.tile(np.eye(len(_SIGMAS)), (len(self), 1, 1))
+        turn[:, :2, :2] = turn[:, 3:, 3:] = jacobian
+        return self._with_covariances(turn @ covariances @ np.swapaxes(turn, 1, 2))
+
+    @property
+    def position_errors(self) -> dict[str, Float]:
+        """Errors of positions as columns of `Matches`.
+
+        They are sigma_u and sigma_v and, if errors are correlated, rho_uv, each (N,); empty without
+        errors.
+        """
+        if self.sigma_u is None or self.sigma_v is None:
+            return {}
+        out = {"sigma_u": self.sigma_u, "sigma_v": self.sigma_v}
+        if self.correlations is not None:
+            out["rho_uv"] = np.clip(self.correlations[:, 0, 1], -LARGEST_RHO, LARGEST_RHO)
+        return out
 
     def select(self, which: NDArray[Any]) -> ReferenceCatalog:
         """Select stars by mask or indices.
@@ -146,6 +225,8 @@ class ReferenceCatalog:
         arrays = {name: values[which] for name, values in columns_of(self, _COLUMNS).items()}
         if isinstance(self.epoch, np.ndarray):
             arrays["epoch"] = self.epoch[which]
+        if self.correlations is not None:
+            arrays["correlations"] = self.correlations[which]
         return replace(self, **arrays, star=self.star[which])
 
     def by_code(self, *names: str) -> Float | None:
@@ -182,9 +263,10 @@ class ReferenceCatalog:
 
             u(t) = u + pm (t - t0),   sigma(t)^2 = sigma^2 + sigma_pm^2 (t - t0)^2
 
-        Errors of positions and proper motions are treated as uncorrelated, which holds at the mean
-        epoch of the catalogue's observations. Without proper motions, positions do not change.
-        Without errors of the motions, or of the positions, the errors do not change.
+        With correlations, all covariances are carried to the new epoch. Without them, errors of
+        positions and proper motions are treated as uncorrelated, which holds at the mean epoch of
+        the catalogue's observations. Without proper motions, positions do not change. Without
+        errors of the motions, or of the positions, the errors do not change.
 
         Parameters
         ----------
@@ -209,6 +291,12 @@ class ReferenceCatalog:
                 "has proper motions but no epoch", where=self.source, do="give the epoch"
             )
         dt = year - np.asarray(self.epoch, float)
+        u, v = self.u + self.pm_u * dt, self.v + self.pm_v * dt
+        if self.correlations is not None:
+            carry = np.tile(np.eye(len(_SIGMAS)), (len(self), 1, 1))
+            carry[:, 0, 3] = carry[:, 1, 4] = dt
+            moved = carry @ self.covariances @ np.swapaxes(carry, 1, 2)
+            return self._with_covariances(moved, u=u, v=v, epoch=year)
         sigma_u, sigma_v = self.sigma_u, self.sigma_v
         if sigma_u is not None and self.sigma_pm_u is not None:
             sigma_u = np.hypot(sigma_u, self.sigma_pm_u * dt)
@@ -216,8 +304,8 @@ class ReferenceCatalog:
             sigma_v = np.hypot(sigma_v, self.sigma_pm_v * dt)
         return replace(
             self,
-            u=self.u + self.pm_u * dt,
-            v=self.v + self.pm_v * dt,
+            u=u,
+            v=v,
             sigma_u=sigma_u,
             sigma_v=sigma_v,
             epoch=year,
@@ -247,24 +335,22 @@ class ReferenceCatalog:
             return then
         # parallax factors at the middle of the field are used for the whole field
         east, north = parallax_factors(year_of(epoch), *self.tangent_point)[0]
-        sigmas = {}
-        u, v = then.sigma_u, then.sigma_v
-        if self.sigma_parallax is not None and u is not None and v is not None:
-            sigmas = {
-                "sigma_u": np.hypot(u, east * self.sigma_parallax),
-                "sigma_v": np.hypot(v, north * self.sigma_parallax),
-            }
-        return replace(
-            then,
-            u=then.u + east * self.parallax,
-            v=then.v + north * self.parallax,
-            **sigmas,
-            parallax=None,
-            sigma_parallax=None,
-        )
+        seen = replace(then, u=then.u + east * self.parallax, v=then.v + north * self.parallax)
+        without: dict[str, Any] = {"parallax": None, "sigma_parallax": None}
+        if self.sigma_parallax is None or self.sigma_u is None or not self.sigma_parallax.any():
+            return replace(seen, **without)
+        carry = np.eye(len(_SIGMAS))
+        carry[:2, 2] = east, north
+        carry[2, 2] = 0.0
+        return seen._with_covariances(carry @ seen.covariances @ carry.T, **without)
 
     def mirrored(self) -> ReferenceCatalog:
         """Catalogue with the sign of u reversed; tangent point and parallaxes are removed."""
+        correlations = self.correlations
+        if correlations is not None:
+            sign = np.array([-1.0, 1.0, 0.0, -1.0, 1.0])
+            correlations = correlations * np.outer(sign, sign)
+            correlations[:, 2, 2] = 1.0
         return replace(
             self,
             u=-self.u,
@@ -272,6 +358,7 @@ class ReferenceCatalog:
             tangent_point=None,
             parallax=None,
             sigma_parallax=None,
+            correlations=correlations,
         )
 
 
@@ -291,13 +378,16 @@ _ALIASES: dict[str, tuple[str, ...]] = {
     "epoch": ("epoch", "t0", *ALIASES["catalogue_epoch"]),
     "mag": (*ALIASES["mag"], "g", "m"),
     "star": ALIASES["star"],
+    "rho_uv": ALIASES["rho_uv"],
+    **{key: ALIASES[key] for key in sorted(CORRELATIONS)},
 }
 _NAME_PAIRS = (("u", "v"), ("ra", "dec"), *_PAIRS)
 # keys under which tables of matches know these quantities
 _ALSO = {"sigma_ra": "sigma_u", "sigma_dec": "sigma_v", "pm_ra": "pm_u", "pm_dec": "pm_v"}
 _ALSO |= {"sigma_pm_ra": "sigma_pm_u", "sigma_pm_dec": "sigma_pm_v", "catalogue_epoch": "epoch"}
 _MOTIONS = frozenset(("pm_u", "pm_v", "sigma_pm_u", "sigma_pm_v"))
-_SPARED = frozenset(_PARALLAX)  # missing values of these quantities count as 0
+# missing values of these quantities count as 0
+_SPARED = frozenset(_PARALLAX) | CORRELATIONS
 
 
 def read_catalog(
@@ -361,11 +451,13 @@ def catalog_from_table(
     table : table
         Any object that `Matches.from_table` accepts.
     columns : mapping of str to str, optional
-        Column of each quantity: u v ra dec sigma_u sigma_v pm_u pm_v sigma_pm_u sigma_pm_v parallax
-        sigma_parallax epoch mag star; an empty name omits the quantity. With ra and dec, positions
-        are projected to the tangent plane in arcsec. pm_u (pm_ra) is then the motion to the east,
-        which includes the factor cos(dec); errors and motions are rotated to the axes of the plane;
-        and stars with a missing value, in most cases a missing motion, are left out.
+        Column of each quantity: u v ra dec sigma_u sigma_v rho_uv pm_u pm_v sigma_pm_u sigma_pm_v
+        parallax sigma_parallax epoch mag star, and the correlations corr_ra_dec and others of
+        `ReadOptions`; an empty name omits the quantity. With ra and dec, positions are projected to
+        the tangent plane in arcsec. pm_u (pm_ra) is then the motion to the east, which includes the
+        factor cos(dec); errors, motions and correlations are rotated to the axes of the plane; and
+        stars with a missing value, in most cases a missing motion, are left out. Missing
+        correlations count as 0.
     source : str, optional
         Name of the file, for error messages.
     unit : str, optional
@@ -404,12 +496,7 @@ def catalog_from_table(
             where=source,
             do="rename the columns, or name them in the option 'columns'",
         )
-    unread = {"u", "v"} if on_sky else {"ra", "dec", *_PARALLAX}
-    unread |= {
-        column_name for pair in _PAIRS for column_name in pair if not set(pair) <= set(column_names)
-    }
-    if on_sky and "pm_u" in unread:
-        unread |= _MOTIONS
+    unread = _unread(column_names, on_sky=on_sky)
     column_names = {key: name for key, name in column_names.items() if key not in unread}
     notes: tuple[str, ...] = ()
     rows = np.arange(len(table))
@@ -457,19 +544,61 @@ def catalog_from_table(
     elif notes:
         out["star"] = rows
     out["epoch"] = column("epoch").years() if "epoch" in column_names else epoch
-    if on_sky:
-        sigma, motion, sigma_motion = (
-            np.stack([out.pop(key) for key in pair]) if pair[0] in out else None for pair in _PAIRS
-        )
-        out |= onto_plane(
-            *sky_columns(quantities),
-            point,
-            sigma=sigma,
-            motion=motion,
-            sigma_motion=sigma_motion,
-            where=source,
-        )
-    return ReferenceCatalog(**out, unit=base, source=source, notes=notes)
+    if not on_sky:
+        if "rho_uv" in column_names:
+            out["correlations"] = _of_positions(column("rho_uv"))
+        return ReferenceCatalog(**out, unit=base, source=source, notes=notes)
+    out |= {"unit": base, "source": source, "notes": notes}
+    return _on_plane(quantities, out, point)
+
+
+def _unread(found: Collection[str], *, on_sky: bool) -> set[str]:
+    """Quantities that are not read although a table has them, because others are missing."""
+    unread = {"u", "v", "rho_uv"} if on_sky else {"ra", "dec", *_PARALLAX, *CORRELATIONS}
+    unread |= {name for pair in _PAIRS for name in pair if not set(pair) <= set(found)}
+    if on_sky and "pm_u" in unread:
+        unread |= _MOTIONS
+    if "sigma_u" in unread:
+        unread |= {"rho_uv", *CORRELATIONS}
+    return unread
+
+
+def _on_plane(
+    quantities: Quantities, out: dict[str, Any], point: tuple[float, float] | None
+) -> ReferenceCatalog:
+    """Catalogue on a tangent plane, from arguments of `ReferenceCatalog` along east and north."""
+    sky_errors = {
+        name: out[key] for name, key in zip(PARAMETERS, _SIGMAS, strict=True) if key in out
+    }
+    sigma, motion, sigma_motion = (
+        np.stack([out.pop(key) for key in pair]) if pair[0] in out else None for pair in _PAIRS
+    )
+    ra, dec = sky_columns(quantities)
+    source = quantities.source
+    out |= onto_plane(
+        ra, dec, point, sigma=sigma, motion=motion, sigma_motion=sigma_motion, where=source
+    )
+    catalog = ReferenceCatalog(**out)
+    correlations = correlation_matrices(quantities, sky_errors)
+    if correlations is None:
+        return catalog
+    errors = np.stack([sky_errors.get(name, np.zeros(len(ra))) for name in PARAMETERS], axis=1)
+    return catalog.with_errors_of(
+        with_correlations(errors, correlations),
+        tangent_jacobian(ra, dec, out["tangent_point"], where=source),
+    )
+
+
+def _of_positions(column: SourceColumn) -> Float:
+    """Correlation matrices (N, 5, 5) from a column with the correlation of u and v."""
+    rho = column.numbers_or(0.0)
+    beyond = np.abs(rho) > 1.0
+    if beyond.any():
+        bad = int(np.argmax(beyond))
+        raise column.fail(bad, f"a correlation is {rho[bad]:g}, and is 1 at most")
+    out = np.tile(np.eye(len(_SIGMAS)), (len(rho), 1, 1))
+    out[:, 0, 1] = out[:, 1, 0] = rho
+    return out
 
 
 def _identities(column: SourceColumn) -> Int:

@@ -1,4 +1,4 @@
-"""Covariances of errors in u and v, as matrices and as columns.
+"""Covariances of errors in u and v and of astrometric parameters, as matrices and as columns.
 
 This module imports little, because sky positions of single files need it.
 """
@@ -24,3 +24,20 @@ def errors_of(covariance: Float) -> dict[str, Float]:
     sigma_u, sigma_v = np.sqrt(np.einsum("nii->in", covariance))
     rho = np.clip(covariance[:, 0, 1] / (sigma_u * sigma_v), -LARGEST_RHO, LARGEST_RHO)
     return {"sigma_u": sigma_u, "sigma_v": sigma_v, "rho_uv": rho}
+
+
+def with_correlations(sigma: Float, correlations: Float) -> Float:
+    """Covariances (N, n, n) of errors (N, n) with correlation matrices (N, n, n)."""
+    return np.asarray(correlations * sigma[:, :, None] * sigma[:, None])
+
+
+def without_sizes(covariance: Float) -> tuple[Float, Float]:
+    """Errors (N, n) and correlation matrices (N, n, n) of covariances (N, n, n).
+
+    Errors of zero have no correlations.
+    """
+    sigma = np.sqrt(np.einsum("nii->ni", covariance))
+    inverse = 1.0 / np.where(sigma > 0, sigma, np.inf)
+    out = np.clip(with_correlations(inverse, covariance), -1.0, 1.0)
+    np.einsum("nii->ni", out)[:] = 1.0
+    return sigma, out

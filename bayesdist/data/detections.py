@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.data.covariances import covariances_of
 from bayesdist.data.tables.checks import COMPLETED, check_columns, columns_of
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Float, Int
@@ -16,7 +17,8 @@ from bayesdist.utils.arrays import Float, Int
 NO_STAR = -1
 
 _CODES = ("exposure", "chip", "star", "row")
-_COLUMNS = ("x", "y", "sigma", "mag", "q", *_CODES)
+_ELLIPSE = ("sigma_x", "sigma_y", "rho_xy")
+_COLUMNS = ("x", "y", "sigma", *_ELLIPSE, "mag", "q", *_CODES)
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +49,8 @@ class Detections:
         Quality of the PSF fit: 0 is perfect, large is poor.
     row : ndarray of int, optional
         Row in the file, counted from 0.
+    sigma_x, sigma_y, rho_xy : ndarray, optional
+        Standard errors of x and of y in pixels, and the correlation of both.
 
     Raises
     ------
@@ -67,6 +71,9 @@ class Detections:
     source: str = "detections"
     q: Float | None = None
     row: Int = COMPLETED
+    sigma_x: Float | None = None
+    sigma_y: Float | None = None
+    rho_xy: Float | None = None
 
     def __post_init__(self) -> None:
         n = np.size(self.x)
@@ -86,7 +93,7 @@ class Detections:
             integers=_CODES,
             where=self.where,
             place=lambda index: f"{self.source}, row {self.row[index] + 1}",
-            positive=("sigma",),
+            positive=("sigma", "sigma_x", "sigma_y"),
         )
 
     def __len__(self) -> int:
@@ -107,6 +114,14 @@ class Detections:
     def points(self) -> Float:
         """Positions (N, 2) of the detections, in pixels."""
         return np.column_stack([self.x, self.y])
+
+    @property
+    def covariances(self) -> Float | None:
+        """Covariances (N, 2, 2) of x and y in square pixels; None without `sigma_x`."""
+        if self.sigma_x is None or self.sigma_y is None:
+            return None
+        rho = 0.0 if self.rho_xy is None else self.rho_xy
+        return covariances_of(self.sigma_x, self.sigma_y, rho)
 
     @property
     def chips(self) -> tuple[int, ...]:

@@ -24,7 +24,7 @@ Calabretta & Greisen 2002, A&A 395, 1077, Section 5.1.3, written as standard coo
 
 from __future__ import annotations
 
-from collections.abc import Container, Mapping
+from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass
 from itertools import combinations
 from typing import TYPE_CHECKING, Any
@@ -276,6 +276,30 @@ def _errors_at(
     if not states_correlations(quantities.found):
         return out, None
     return out, np.clip(C[1] / (out[0] * out[1]), -LARGEST_RHO, LARGEST_RHO)
+
+
+def correlation_matrices(quantities: Quantities, names: Iterable[str]) -> Float | None:
+    """Correlation matrices (N, 5, 5) of the errors of `PARAMETERS`; None if there are no columns.
+
+    `names` are the parameters that have errors.  Missing correlations count as zero.  InputError
+    for correlations that no covariance has.
+    """
+    parameters = frozenset(names)
+    given = {
+        pair: _checked(column, column.numbers_or(0.0))
+        for pair in combinations(PARAMETERS, 2)
+        if (key := "corr_{}_{}".format(*pair)) in quantities and parameters.issuperset(pair)
+        for column in [quantities[key]]
+    }
+    if not given:
+        return None
+    n = len(quantities)
+    shrinkage = _shrinkage(quantities, given, n)
+    out = np.tile(np.eye(len(PARAMETERS)), (n, 1, 1))
+    for pair, values in given.items():
+        i, j = (PARAMETERS.index(name) for name in pair)
+        out[:, i, j] = out[:, j, i] = shrinkage * values
+    return out
 
 
 def states_correlations(found: Container[str]) -> bool:

@@ -10,11 +10,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from astropy.table import Table
 
+from bayesdist.data.covariances import without_sizes
 from bayesdist.data.detections import Detections
 from bayesdist.data.formats.files import exposure_names, input_files, kind_of, mission_formats
+from bayesdist.data.reading.centroids import pixel_covariances
+from bayesdist.data.reading.columns import CENTROIDS
 from bayesdist.data.repeated import first_duplicate
 from bayesdist.data.tables.checks import COMPLETED, counted, row_number
-from bayesdist.data.tables.column import SourceColumn
+from bayesdist.data.tables.column import Quantities, SourceColumn
 from bayesdist.data.tables.names import ALIASES, BASIC, find_columns, origin_of
 from bayesdist.errors import FormatError, InputError
 from bayesdist.files.tables import TABLE_SUFFIXES, read_table
@@ -30,10 +33,8 @@ _LIST_ALIASES = {key: BASIC[key] for key in ("exposure", "chip", "epoch")} | {
     "mag": (*ALIASES["mag"], "m"),
     "flux": ALIASES["flux"],
     "q": ("q", "qfit", "quality"),
-    "sigma_x": ("sigma_x", "x_err", "x_error", "errx2win_image", "errx2psf_image", "errx2_image"),
-    "sigma_y": ("sigma_y", "y_err", "y_error", "erry2win_image", "erry2psf_image", "erry2_image"),
+    **{key: ALIASES[key] for key in CENTROIDS},
 }
-_VARIANCE = ("errx2", "erry2")  # prefixes of SExtractor columns that hold variances
 
 
 @dataclass(frozen=True)
@@ -122,13 +123,14 @@ def read_star_lists(
         format added by a mission. A table with a column of exposures may hold several of them; any
         other file is one exposure, named after the file.
     columns : mapping of str to str, optional
-        Column of each quantity: x y exposure chip mag flux q epoch sigma_x sigma_y. Without a
-        column of chips, all are chip 1. Formats of missions have fixed columns. Pixels are
+        Column of each quantity: x y exposure chip mag flux q epoch sigma_x sigma_y rho_xy. Without
+        a column of chips, all are chip 1. Formats of missions have fixed columns. Pixels are
         converted if the column names or the header show that they count from 0. Fluxes are
         converted to magnitudes with zero point 0 if there are no magnitudes and all fluxes are
         positive.
     errors : bool, optional
-        True to read errors of the pixels; the rms of the errors of x and y is used.
+        True to read the errors of x and y, and their correlation if there is such a column. `sigma`
+        of the detections is the rms of both errors.
 
     Returns
     -------
@@ -214,7 +216,12 @@ def _of_table(
         if mag is not None:
             values["mag"] = mag
     if errors:
-        values["sigma"] = np.sqrt((_variance(column("sigma_x")) + _variance(column("sigma_y"))) / 2)
+        covariance = pixel_covariances(Quantities(table, column_names, source))
+        sigma, correlations = without_sizes(covariance)
+        values["sigma"] = np.sqrt((sigma**2).mean(axis=1))
+        values["sigma_x"], values["sigma_y"] = sigma.T
+        if "rho_xy" in column_names:
+            values["rho_xy"] = correlations[:, 0, 1]
     if "exposure" in column_names:
         codes, names = column("exposure").labels()
     else:
@@ -229,6 +236,9 @@ def _of_table(
         mag=values.get("mag"),
         q=values.get("q"),
         sigma=values.get("sigma"),
+        sigma_x=values.get("sigma_x"),
+        sigma_y=values.get("sigma_y"),
+        rho_xy=values.get("rho_xy"),
         source=source,
     )
     years = column("epoch").years() if "epoch" in column_names else None
@@ -242,12 +252,3 @@ def _of_table(
         )
         for exposure_name, rows in zip(names, np.split(order, edges[1:-1]), strict=True)
     ]
-
-
-def _variance(column: SourceColumn) -> Float:
-    """Variance of pixels (N,); SExtractor columns already hold variances."""
-    values = column.numbers()
-    bad = values <= 0
-    if bad.any():
-        raise column.fail(int(np.argmax(bad)), "the error of the pixel is not positive")
-    return values if column.name.lower().startswith(_VARIANCE) else values**2

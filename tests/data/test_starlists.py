@@ -118,13 +118,14 @@ def test_errors_are_those_of_the_program(tmp_path, names, factor):
     table.write(tmp_path / "j1.ecsv")
     [one] = read_star_lists(tmp_path / "j1.ecsv", errors=True)
     np.testing.assert_allclose(one.sigma, np.sqrt((sigma**2).mean(axis=0)))
+    np.testing.assert_allclose([one.sigma_x, one.sigma_y], sigma)
     np.testing.assert_allclose(one.mag, [-5.0, 0.0])
     [bare] = read_star_lists(tmp_path / "j1.ecsv")
     assert bare.sigma is None
     np.testing.assert_array_equal(detections_of([one, replace(one)]).sigma, np.tile(one.sigma, 2))
     table[names[2]][1] = 0.0
     table.write(tmp_path / "j2.ecsv")
-    with pytest.raises(InputError, match=r"row 2.*the error of the pixel is not positive"):
+    with pytest.raises(InputError, match=r"row 2.*error of a pixel coordinate is 0"):
         read_star_lists(tmp_path / "j2.ecsv", errors=True)
     table[names[:2]].write(tmp_path / "j3.ecsv")
     with pytest.raises(InputError, match="no column for 'sigma_x'"):
@@ -132,6 +133,25 @@ def test_errors_are_those_of_the_program(tmp_path, names, factor):
     (tmp_path / "j4.xym").write_text("1 2 -9\n")
     with pytest.raises(InputError, match="has no errors of its pixels; have them measured"):
         read_star_lists(tmp_path / "j4.xym", errors=True)
+
+
+@pytest.mark.parametrize(
+    ("name", "factor"), [("ERRXYWIN_IMAGE", np.array([-0.5, 0.9]) * 3e-4), ("rho_xy", [-0.5, 0.9])]
+)
+def test_ellipses_of_errors_are_those_of_the_program(tmp_path, name, factor):
+    """SExtractor writes covariances, others correlations."""
+    variances = name.startswith("ERR")
+    names = ("ERRX2WIN_IMAGE", "ERRY2WIN_IMAGE") if variances else ("x_err", "y_err")
+    errors = [np.full(2, sigma**2 if variances else sigma) for sigma in (0.01, 0.03)]
+    columns = {"x": [10.0, 20.0], "y": [5.0, 6.0], **dict(zip(names, errors, strict=True))}
+    Table(columns | {name: factor}).write(tmp_path / "j1.ecsv")
+    [one] = read_star_lists(tmp_path / "j1.ecsv", errors=True)
+    for covariance, rho in zip(one.covariances, (-0.5, 0.9), strict=True):
+        expected = [[1e-4, rho * 3e-4], [rho * 3e-4, 9e-4]]
+        np.testing.assert_allclose(covariance, expected)
+    Table(columns | {name: [0.0, 1.0]}).write(tmp_path / "j2.ecsv")
+    with pytest.raises(InputError, match=r"row 2.*is impossible beside the errors of x and y"):
+        read_star_lists(tmp_path / "j2.ecsv", errors=True)
 
 
 def test_text_of_other_programs_is_a_star_list(tmp_path):

@@ -12,7 +12,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Any, TypeAlias
 
@@ -45,6 +45,7 @@ Start = Callable[[Float, Float, Int, float], ArrayLike]
 
 _UNMATCHED = "no counterpart in the catalogue"
 _LEFT_OUT = "exposure left out"
+_STEP = 0.5  # pixels, over which the known distortion is differentiated
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,8 +55,9 @@ class CampaignMatches:
     Parameters
     ----------
     table : Matches
-        Raw pixels with catalogue positions at the epoch of each exposure. `sigma_u` and `sigma_v`
-        are the errors of these positions, without centroid errors.
+        Raw pixels with catalogue positions at the epoch of each exposure. `sigma_u`, `sigma_v` and
+        `rho_uv` are the errors of these positions, together with those of the centroids if all
+        lists have them.
     reports : tuple of ExposureReport
         Reports in the order of the lists.
     left_out : dict of str to str
@@ -204,7 +206,7 @@ def match_campaign(
     refuse_astray([match.report for match in exposure_matches], catalog)
     matched = [stars for stars in lists if stars.name not in failed]
     shown = catalog.mirrored() if views[0].mirrored else catalog
-    table = _table(matched, log, shown, exposure_matches)
+    table = _table(matched, log, shown, exposure_matches, start)
     if failed:
         n = sum(len(stars) for stars in lists) - table.n_rows
         table = table.with_counts(table.n_rows + n, {**table.rejected, _LEFT_OUT: n})
@@ -288,6 +290,7 @@ def _table(
     log: ExposureLog,
     catalog: ReferenceCatalog,
     found: Sequence[ExposureMatch],
+    start: Start,
 ) -> Matches:
     """Table of all matches, with the optional columns that every list has."""
     reports = [exposure_match.report for exposure_match in found]
@@ -308,17 +311,15 @@ def _table(
     if unmatched:
         rejected[_UNMATCHED] = unmatched
     star = np.concatenate([match.catalog_index for match in found])
-    sigmas: dict[str, Any] = {}
-    if catalog.sigma_u is not None:
-        pairs = [required(m.sigma, "a match has no errors") for m in found]
-        sigmas["sigma_u"] = np.concatenate([pair[0] for pair in pairs])
-        sigmas["sigma_v"] = np.concatenate([pair[1] for pair in pairs])
-    return Matches(
+    errors: dict[str, Any] = {
+        name: np.concatenate([match.errors[name] for match in found]) for name in found[0].errors
+    }
+    table = Matches(
         x=joined([entry.x for entry in lists]),
         y=joined([entry.y for entry in lists]),
         u=np.concatenate([match.u for match in found]),
         v=np.concatenate([match.v for match in found]),
-        **sigmas,
+        **errors,
         unit=catalog.unit,
         epoch=np.array([log[entry.name].epoch for entry in lists])[each],
         mag=joined(mags) if len(mags) == len(lists) else None,
@@ -336,3 +337,31 @@ def _table(
         rejected=rejected,
         tangent_point=catalog.tangent_point,
     )
+    centroids = [
+        _in_uv(entry, log[entry.name].epoch, match, start)
+        for entry, match in zip(lists, found, strict=True)
+        if entry.covariances is not None
+    ]
+    if len(centroids) < len(lists):
+        return table
+    total = np.concatenate(centroids)
+    return table.with_covariances(total if table.sigma_u is None else total + table.covariances())
+
+
+def _in_uv(stars: Detections, epoch: float, match: ExposureMatch, start: Start) -> Float:
+    """Covariances (n, 2, 2) of the centroids of matched stars, converted from pixels to u and v.
+
+    The conversion is that of the known distortion, with the rotation and scale of the match.
+    """
+    matched = stars.select(match.index)
+    J = np.empty((len(matched), 2, 2))
+    for axis, name in enumerate(("x", "y")):
+        low, high = (
+            _started(start, replace(matched, **{name: getattr(matched, name) + by}), epoch)
+            for by in (-_STEP, _STEP)
+        )
+        J[:, :, axis] = (high - low) / (2 * _STEP)
+    angle = np.radians(match.report.rotation)
+    c, s = match.report.scale * np.cos(angle), match.report.scale * np.sin(angle)
+    J = np.array([[c, -s], [s, c]]) @ J
+    return np.asarray(J @ required(matched.covariances, "no errors") @ np.swapaxes(J, 1, 2))

@@ -72,7 +72,8 @@ class ExposureMatch:
     catalog_index: Int
     u: Float
     v: Float
-    sigma: tuple[Float, Float] | None  # errors (n,) of the catalogue positions in u and v
+    # errors (n,) of the catalogue positions as columns of `Matches`; empty if they have none
+    errors: Mapping[str, Float]
 
 
 def match_exposure(
@@ -168,9 +169,7 @@ def match_exposure(
     zero_point, within = _range(stars, rows, index, catalog, partner)
     expected &= within
     matched = int(expected[partner].sum())
-    sigma = None
-    if catalog.sigma_u is not None and catalog.sigma_v is not None:
-        sigma = (catalog.sigma_u[partner], catalog.sigma_v[partner])
+    errors = {name: values[partner] for name, values in catalog.position_errors.items()}
     asked = {chip_number: int((chip == chip_number).sum()) for chip_number in chips}
     per_chip = {chip_number: int((chip[index] == chip_number).sum()) for chip_number in chips}
     report = ExposureReport(
@@ -196,7 +195,7 @@ def match_exposure(
         coincidences=coincidences,
     )
     return ExposureMatch(
-        report, rows[index], partner, catalog.u[partner], catalog.v[partner], sigma
+        report, rows[index], partner, catalog.u[partner], catalog.v[partner], errors
     )
 
 

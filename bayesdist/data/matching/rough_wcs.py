@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +40,7 @@ from bayesdist.data.matching.similarity import (
     grown_map,
     pattern_index,
 )
+from bayesdist.data.reading.columns import CENTROIDS
 from bayesdist.data.reading.options import ReadOptions
 from bayesdist.data.reading.table import (
     SKY_COLUMN,
@@ -50,12 +52,14 @@ from bayesdist.data.reading.table import (
 )
 from bayesdist.data.sky import (
     MOTIONS,
+    PARAMETERS,
     SKY_QUANTITIES,
     mean_direction,
     reference_sky,
     separation,
     sky_columns,
     sky_of_plane,
+    tangent_jacobian,
     tangent_plane,
 )
 from bayesdist.data.tables.checks import without_missing
@@ -85,6 +89,7 @@ _FROM_DETECTIONS = (
         "sigma_u",
         "sigma_v",
         "rho_uv",
+        *CENTROIDS,
     ),
 )
 _FROM_CATALOGUE = ("ra", "dec", *SKY_QUANTITIES, "mag", "flux", "colour", "star")
@@ -138,10 +143,11 @@ def match(
     -------
     Matches
         Magnitudes, fluxes and errors come from the detections if they have them, and otherwise from
-        the catalogue. `star` is the column of that name in the catalogue, or else its row counted
-        from 0. `u_nominal` and `v_nominal` are the positions by the refined WCS, and `match_radius`
-        is the radius in arcsec. `notes` state how many detections were matched and how the WCS was
-        refined; `rejected` counts the others.
+        the catalogue, with all its correlations. Errors of centroids in pixels (x_err and others)
+        are added to those of the catalogue. `star` is the column of that name in the catalogue, or
+        else its row counted from 0. `u_nominal` and `v_nominal` are the positions by the refined
+        WCS, and `match_radius` is the radius in arcsec. `notes` state how many detections were
+        matched and how the WCS was refined; `rejected` counts the others.
 
     Raises
     ------
@@ -286,15 +292,24 @@ def _sky_table_of(catalogue: ReferenceCatalog) -> QTable:
             do="read it from ra and dec, or match positions on a plane with match_table",
         )
     catalogue = catalogue.rescaled(float(apu.Unit(catalogue.unit).to("arcsec")), "arcsec")
-    ra, dec = sky_of_plane(catalogue.u, catalogue.v, catalogue.tangent_point or (0.0, 0.0))
+    point = catalogue.tangent_point or (0.0, 0.0)
+    ra, dec = sky_of_plane(catalogue.u, catalogue.v, point)
+    if catalogue.correlations is not None:
+        from_plane = np.asarray(np.linalg.inv(tangent_jacobian(ra, dec, point)), float)
+        catalogue = catalogue.with_errors_of(catalogue.covariances, from_plane)
     table = QTable({"ra": ra * apu.deg, "dec": dec * apu.deg, "star": catalogue.star})
-    names = {"ra_error": "sigma_u", "dec_error": "sigma_v", "parallax": "parallax"}
+    names = {"ra_error": "sigma_u", "dec_error": "sigma_v", "parallax": "parallax",
+             "parallax_error": "sigma_parallax"}  # fmt: skip
     motions = {"pmra": "pm_u", "pmdec": "pm_v", "pmra_error": "sigma_pm_u",
                "pmdec_error": "sigma_pm_v"}  # fmt: skip
     for columns, unit in ((names, apu.arcsec), (motions, apu.arcsec / apu.yr)):
         for name, key in columns.items():
             if getattr(catalogue, key) is not None:
                 table[name] = getattr(catalogue, key) * unit
+    if catalogue.correlations is not None:
+        for (i, first), (j, second) in combinations(enumerate(PARAMETERS), 2):
+            name = ALIASES[f"corr_{first}_{second}"][0]
+            table[name] = catalogue.correlations[:, i, j]
     if catalogue.mag is not None:
         table["mag"] = catalogue.mag
     if catalogue.epoch is not None:
@@ -576,12 +591,16 @@ class _Found:
         for key in _FROM_CATALOGUE:
             if key in stars.columns and not ({key} | _INSTEAD.get(key, set())) & sources.keys():
                 sources[key] = stars.columns
+        names = {}
         for key, columns in sources.items():
-            table[key] = _column(
+            # names of the errors of centroids tell errors from variances
+            names[key] = columns[key].name if key in CENTROIDS else key
+            table[names[key]] = _column(
                 columns, key, index if columns is rough_detections.columns else partner
             )
         notes = list(self.notes)
-        if options.sigma == "columns" and "sigma_ra" in sources and "sigma_u" not in sources:
+        has_own_errors = not {"sigma_u", "sigma_x"}.isdisjoint(sources)
+        if options.sigma == "columns" and "sigma_ra" in sources and not has_own_errors:
             notes.append(CATALOGUE_ERRORS_ALONE)
         if "star" not in table.colnames:
             table["star"] = stars.rows[partner]
@@ -589,8 +608,9 @@ class _Found:
         if rough_detections.epoch is not None and "epoch" not in table.colnames:
             table["epoch"] = rough_detections.epoch[index]
         unused = dict.fromkeys(ALIASES, "")
+        unnamed = {name: name for name in table.colnames if name not in names.values()}
         settings = ReadOptions(
-            columns=unused | {name: name for name in table.colnames},
+            columns=unused | unnamed | names,
             sigma=options.sigma,
             pixel_origin=rough_detections.origin,
             tangent_point=point,

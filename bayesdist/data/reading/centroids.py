@@ -50,7 +50,7 @@ def with_centroid_errors(quantities: Quantities, columns: Mapping[str, Any]) -> 
     if "sigma_x" not in quantities:
         return {}
     J = _jacobians(columns, quantities.source)
-    total = J @ _covariances(quantities) @ np.swapaxes(J, 1, 2)
+    total = J @ pixel_covariances(quantities) @ np.swapaxes(J, 1, 2)
     note = "errors of the centroids were converted from pixels"
     if "sigma_u" in columns:
         total += covariances_of(columns["sigma_u"], columns["sigma_v"], columns.get("rho_uv", 0.0))
@@ -58,8 +58,11 @@ def with_centroid_errors(quantities: Quantities, columns: Mapping[str, Any]) -> 
     return {**errors_of(total), "notes": (*columns.get("notes", ()), note)}
 
 
-def _covariances(quantities: Quantities) -> Float:
-    """Covariances (N, 2, 2) of the centroids in pixels squared."""
+def pixel_covariances(quantities: Quantities) -> Float:
+    """Covariances (N, 2, 2) of the centroids in pixels squared.
+
+    InputError if errors are not positive or not in pixels, or if a correlation is impossible.
+    """
     xx, yy = (_variance(quantities[key]) for key in ("sigma_x", "sigma_y"))
     rho = np.zeros(len(xx))
     if "rho_xy" in quantities:

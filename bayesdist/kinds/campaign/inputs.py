@@ -26,6 +26,8 @@ from bayesdist.kinds.star_lists import StarLists, lists_of
 from bayesdist.model import DistortionModel, LookupTable
 from bayesdist.products.common.document import Document
 
+WITHOUT_PARALLAX = np.array([0, 1, 3, 4])  # of the parameters of a catalogue's correlations
+
 
 @dataclass(frozen=True, eq=False)
 class Inputs:
@@ -224,8 +226,15 @@ def errors_by_star(catalog: ReferenceCatalog, largest_vafactor: float = 1.0) -> 
         return None
     motion = catalog.by_code("sigma_pm_u", "sigma_pm_v")
     epoch = catalog.by_code("epoch")
+    correlations = None
+    if catalog.correlations is not None:
+        n = 2 if motion is None else 4
+        correlations = np.tile(np.eye(n), (len(position), 1, 1))
+        of_both = catalog.correlations[:, WITHOUT_PARALLAX[:, None], WITHOUT_PARALLAX]
+        correlations[catalog.star] = of_both[:, :n, :n]
     return StarErrors(
         position / largest_vafactor,
         None if motion is None else motion / largest_vafactor,
         None if epoch is None else epoch[:, 0],
+        correlations,
     )
