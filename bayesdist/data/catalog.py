@@ -40,6 +40,7 @@ from bayesdist.utils.quantities import Direction, Epoch, direction_in, year_of
 _PAIRS = (("sigma_u", "sigma_v"), ("pm_u", "pm_v"), ("sigma_pm_u", "sigma_pm_v"))
 _PARALLAX = ("parallax", "sigma_parallax")
 _COLUMNS = ("u", "v", "mag", *(name for pair in _PAIRS for name in pair), *_PARALLAX)
+ROUNDING = 1e-9  # of correlations
 # errors of the parameters that `ReferenceCatalog.correlations` are of, in their order
 _SIGMAS = ("sigma_u", "sigma_v", "sigma_parallax", "sigma_pm_u", "sigma_pm_v")
 
@@ -153,7 +154,7 @@ class ReferenceCatalog:
             )
         n = (len(self), len(_SIGMAS), len(_SIGMAS))
         possible = correlations.shape == n and np.isfinite(correlations).all()
-        if not possible or (np.abs(correlations) > 1.0).any():
+        if not possible or (np.abs(correlations) > 1.0 + ROUNDING).any():
             raise InputError(
                 f"correlations are not {n[0]} matrices of 5 x 5 numbers from -1 to 1",
                 where=self.source,

@@ -86,6 +86,49 @@ def test_what_the_table_holds(rng):
     assert t.n_rows == sum(len(one) for one in lists) == len(t) + sum(t.rejected.values())
 
 
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_matches_have_the_covariances_of_catalogue_and_centroids(rng, mirrored):
+    """Of the catalogue at the epoch, and of the pixels turned by the roll of the exposure."""
+    catalog, lists, log, _, rolls = campaign(rng, 3, motion=0.05)
+    n = len(catalog)
+    root = rng.standard_normal((n, 5, 5))
+    C = root @ np.swapaxes(root, 1, 2)
+    size = 1 / np.sqrt(np.einsum("nii->ni", C))
+    catalog = replace(catalog, correlations=C * size[:, :, None] * size[:, None])
+    sigma = np.array([0.01, 0.02, 0.0, 0.003, 0.004])  # as in `campaign`
+    C = catalog.correlations * np.outer(sigma, sigma)
+    lists = [
+        replace(
+            one,
+            sigma_x=rng.uniform(0.01, 0.1, len(one)),
+            sigma_y=rng.uniform(0.01, 0.1, len(one)),
+            rho_xy=rng.uniform(-0.9, 0.9, len(one)),
+        )
+        for one in lists
+    ]
+    if mirrored:
+        catalog = catalog.mirrored()
+    table = match_campaign(lists, log, catalog, start, mirrored=(mirrored,)).table
+    for k, one in enumerate(lists):
+        here = table.exposure == k
+        dt = log[one.name].epoch - 2004.5
+        A = np.array([[1, 0, 0, dt, 0], [0, 1, 0, 0, dt]])
+        angle = np.radians(rolls[k])
+        R = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        pixels = one.covariances[table.row[here]]
+        expected = A @ C[table.star[here] - 1000] @ A.T + R @ pixels @ R.T
+        found = table.select(here).covariances()
+        np.testing.assert_allclose(found, expected, atol=3e-3 * np.abs(expected).max())
+    # some lists alone have errors: those of the centroids are left out
+    some = match_campaign(
+        [replace(lists[0], sigma_x=None), *lists[1:]], log, catalog, start, mirrored=(mirrored,)
+    ).table
+    first = some.select(some.exposure == 1)
+    dt = log["e1"].epoch - 2004.5
+    A = np.array([[1, 0, 0, dt, 0], [0, 1, 0, 0, dt]])
+    np.testing.assert_allclose(first.covariances(), A @ C[first.star - 1000] @ A.T, rtol=1e-9)
+
+
 def test_motions_are_needed_where_stars_move(rng):
     catalog, lists, log, _, _ = campaign(rng, 2, motion=0.3, left=0.0)
     moving = match_campaign(lists, log, catalog, start)

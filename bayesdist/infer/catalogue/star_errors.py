@@ -30,6 +30,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bayesdist.data.covariances import without_sizes
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer.equations.scaled import one_thread
@@ -65,6 +66,37 @@ class StarErrors:
     motion: Float | None = None
     epoch: Float | None = None
     correlations: Float | None = None
+
+    @classmethod
+    def contained_in(cls, matches: Matches) -> StarErrors:
+        """Errors of positions that are at most those of any match of the star, on all directions.
+
+        They are the smallest covariance of the matches of a star, reduced where that of another
+        match is smaller along some direction.
+
+        Parameters
+        ----------
+        matches : Matches
+            Matches with star codes, whose errors are those of the catalogue.
+
+        Returns
+        -------
+        StarErrors
+            Without errors of proper motions; zero for codes without a match.
+        """
+        code, C = matches.column("star"), matches.covariances()
+        n = int(code.max()) + 1
+        det = np.linalg.det(C)
+        first = np.lexsort((det, code))
+        smallest = np.zeros((n, 2, 2))
+        smallest[code[first[::-1]]] = C[first[::-1]]  # the smallest of each star comes last
+        relative = np.linalg.solve(smallest[code], C)
+        half = np.einsum("naa->n", relative) / 2
+        ratio = half - np.sqrt(np.maximum(half**2 - np.linalg.det(relative), 0.0))
+        least = np.ones(n)
+        np.minimum.at(least, code, ratio)
+        sigma, correlations = without_sizes(least[:, None, None] * smallest)
+        return cls(sigma, correlations=correlations)
 
     def levers(self, star: Int, epoch: Float | None) -> Float:
         """Derivatives of matched positions with respect to catalogue position and proper motion.

@@ -36,6 +36,7 @@ class CampaignBlock(StarListsBlock):
     radius: PositiveFloat | None = None
     pm_selection: Literal["reliable", "all"] = "reliable"
     vafactor_source: Literal["log", "earth"] = "log"
+    sigma: Literal["measured", "columns"] = "measured"
 
 
 class CampaignTdd(BaseTdd):

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from bayesdist.app.artefacts.stars import ErrorLaw
+from bayesdist.app.artefacts.stars import QUOTED, ErrorLaw
 from bayesdist.app.run import Run
 from bayesdist.data import centroid_errors
 from bayesdist.data.matches import Matches
@@ -50,8 +50,7 @@ def _fitted(pairs: Matches, inputs: Inputs) -> dict[str, Any]:
     tables, fit_of_tables = fit_tables(pairs, inputs)
     if tables.tables:
         pairs = on_the_chips(corrected_matches(tables.tables, pairs), affine)
-    _, _, total = scatter_by_magnitude(pairs, affine, inputs)
-    errors = ErrorLaw(by_magnitude=centroid_errors(pairs, total), with_catalogue=True)
+    errors = _error_law(pairs, affine, inputs)
     stars = errors.applied(pairs)
     rejection = Rejection(config.fit.clip_chi2, config.fit.clip_abs)
     joint = _joint(stars, affine, inputs, rejection)
@@ -79,6 +78,14 @@ def _fitted(pairs: Matches, inputs: Inputs) -> dict[str, Any]:
         },
         "fit_facts": facts,
     }
+
+
+def _error_law(pairs: Matches, affine: DistortionModel, inputs: Inputs) -> ErrorLaw:
+    """Errors of the centroids by magnitude, unless the star lists have them."""
+    if inputs.has_quoted_errors:
+        return QUOTED
+    _, _, total = scatter_by_magnitude(pairs, affine, inputs)
+    return ErrorLaw(by_magnitude=centroid_errors(pairs, total), with_catalogue=True)
 
 
 def _joint(

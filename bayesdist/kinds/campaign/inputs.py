@@ -50,6 +50,11 @@ class Inputs:
         return float(self.log.values("vafactor").max())
 
     @property
+    def has_quoted_errors(self) -> bool:
+        """True if the star lists have the errors of the centroids."""
+        return self.config.campaign.sigma == "columns"
+
+    @property
     def pixel_arcsec(self) -> float:
         """Pixel size in arcsec; 0.05 if the configuration gives none."""
         return (self.config.detector.scale_mas or 50.0) / 1000
@@ -87,7 +92,7 @@ def read_campaign(config: CampaignConfig, base: Path) -> Inputs:
     whole_log = read_exposures(base / block.exposures)
     full_catalog, plane = read_campaign_catalog(block, base, whole_log)
     log = _exposures_of(block, whole_log)
-    all_lists = lists_of(block, base)
+    all_lists = lists_of(block, base, errors=block.sigma == "columns")
     lists = all_lists.of(log.names)
     missing = sorted(set(log.names) - set(lists.names))
     if missing:

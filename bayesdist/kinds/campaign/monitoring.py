@@ -73,7 +73,8 @@ def fit_new_exposures(release: Run, new: Path) -> tuple[Matches, NewFit, tuple[s
         compute=config.resources(),
         scatter=dict(zip(scatter.kinds, np.sqrt((scatter.tau**2).mean(axis=0)), strict=True)),
     )
-    of_catalogue = _catalogue_errors(pairs)
+    with_centroids = config.campaign.sigma == "columns"
+    of_catalogue = _catalogue_errors(pairs, run, with_centroids=with_centroids)
     if of_catalogue is not None:
         is_same = run is not None and _catalogue_of(run) == _catalogue_of(release.directory)
         made_from = (release.fit, release.matches) if is_same else None
@@ -116,10 +117,28 @@ def _refuse_other_filters(config: Config, pairs: Matches, where: str) -> None:
         )
 
 
-def _catalogue_errors(pairs: Matches) -> StarErrors | None:
-    """Smallest error of each star in its pairs, by star code: the error of the catalogue."""
+def _catalogue_errors(
+    pairs: Matches, run: RunDirectory | None, *, with_centroids: bool
+) -> StarErrors | None:
+    """Errors of the catalogue by star code; None if there are none.
+
+    `with_centroids` is True if the errors of the pairs include those of the centroids.  Otherwise
+    they are the smallest error of each star in its pairs.
+    """
+    if with_centroids:
+        if run is None:
+            raise InputError(
+                "have errors that include those of the centroids, which do not show the errors of "
+                "the catalogue that all exposures of a star have in common",
+                where=", ".join(pairs.sources),
+                do="give the folder of the run that matched them",
+            )
+        matched = Run.of(run)
+        return matched.kind.star_errors(matched)
     if pairs.star is None or pairs.sigma_u is None or pairs.sigma_v is None or pairs.mag is None:
         return None
+    if pairs.rho_uv is not None:
+        return StarErrors.contained_in(pairs)
     sigma = np.full((int(pairs.star.max()) + 1, 2), np.inf)
     for axis, values in enumerate((pairs.sigma_u, pairs.sigma_v)):
         np.minimum.at(sigma[:, axis], pairs.star, values)

@@ -14,7 +14,7 @@ from bayesdist.data.magnitude_errors import MagnitudeErrors
 from bayesdist.data.matches import Matches
 from bayesdist.diagnose.tables import BetweenNodes, measured_between
 from bayesdist.errors import InputError
-from bayesdist.infer import LinearFit, fit_by_magnitude, residuals
+from bayesdist.infer import LinearFit, fit_by_magnitude, fit_linear, residuals
 from bayesdist.infer.nodes import (
     Iteration,
     TableFit,
@@ -94,12 +94,17 @@ def fit_tables(pairs: Matches, inputs: Inputs) -> tuple[StoredLookupTables, Tabl
         if not held:
             return StoredLookupTables(), None
         placed = on_the_chips(corrected_matches(held, pairs), model)
-        fit, _, errors = scatter_by_magnitude(placed, model, inputs)
-        pairs = pairs.with_errors(errors)
+        if inputs.has_quoted_errors:
+            fit = fit_linear(placed, model)
+        else:
+            fit, _, errors = scatter_by_magnitude(placed, model, inputs)
+            pairs = pairs.with_errors(errors)
         between = measured_between(pairs, fit, held, filter=filter, fitted=False)
         of_nodes = _on_the_grid(held, fit, "", grid, partial(_held_variance, held))
         return _stored(held, of_nodes, between), None
-    pairs, rough = _with_errors(pairs, inputs, held)
+    rough = None
+    if not inputs.has_quoted_errors:
+        pairs, rough = _with_errors(pairs, inputs, held)
     table_fit = fit_with_tables(
         pairs,
         model,
