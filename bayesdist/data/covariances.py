@@ -36,7 +36,7 @@ def without_sizes(covariance: Float) -> tuple[Float, Float]:
 
     Errors of zero have no correlations.
     """
-    sigma = np.sqrt(np.einsum("nii->ni", covariance))
+    sigma = np.sqrt(np.maximum(np.einsum("nii->ni", covariance), 0.0))
     inverse = 1.0 / np.where(sigma > 0, sigma, np.inf)
     out = np.clip(with_correlations(inverse, covariance), -1.0, 1.0)
     np.einsum("nii->ni", out)[:] = 1.0

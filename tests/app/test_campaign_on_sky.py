@@ -7,6 +7,7 @@ of a detector that sees the sky as it is or mirrored.  Nothing of the package ma
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +20,8 @@ from astropy.time import Time
 from astropy.wcs import WCS
 from scipy import stats
 
-from bayesdist.data import read_matches
-from bayesdist.infer import load_fit
+from bayesdist.data import Matches, read_matches
+from bayesdist.infer import load_fit, load_posterior, residuals
 from bayesdist.infer.solution.transforms import without_frames
 from tests.app.support import (
     carried_out,
@@ -128,11 +129,22 @@ def sky(rng, n=900):
     )
 
 
-def gaia(rng, stars):
+# of the errors of ra, dec, pmra and pmdec, where they are correlated
+CORRELATIONS = np.array(
+    [[1.0, 0.8, -0.3, -0.2], [0.8, 1.0, -0.2, -0.2], [-0.3, -0.2, 1.0, 0.7], [-0.2, -0.2, 0.7, 1.0]]
+)
+# centroids of trailed images: errors on x and y, px, and their correlation
+TRAILED, RHO = (0.035, 0.02), 0.9
+
+
+def gaia(rng, stars, correlations=None):
     """The catalogue as the archive writes it: no units in the file."""
     n = len(stars.ra)
-    off = ERROR / 3.6e6 * rng.standard_normal((2, n))
-    pm = stars.pm + MOTION * rng.standard_normal((2, n))
+    normal = rng.standard_normal((4, n))
+    if correlations is not None:
+        normal = np.linalg.cholesky(correlations) @ normal
+    off = ERROR / 3.6e6 * normal[:2]
+    pm = stars.pm + MOTION * normal[2:]
     table = Table({"source_id": 4_000_000_000_000_000_000 + 7 * np.arange(n)})
     table["ra"] = stars.ra + off[0] / np.cos(np.radians(stars.dec))
     table["ra_error"] = np.full(n, ERROR)
@@ -144,15 +156,21 @@ def gaia(rng, stars):
     table["pmra_error"] = table["pmdec_error"] = np.full(n, MOTION)
     table["ref_epoch"] = np.full(n, CATALOGUE)
     table["phot_g_mean_mag"] = stars.mag
+    names = ("ra", "dec", "pmra", "pmdec")
+    for i, j in combinations(range(4), 2) if correlations is not None else ():
+        table[f"{names[i]}_{names[j]}_corr"] = np.full(n, correlations[i, j])
     return table
 
 
-def write(folder: Path, sense: int, *, seed=1, change=None, **campaign) -> Path:
-    """Catalogue, log, lists, known distortion and configuration; the path of the last."""
+def write(folder: Path, sense: int, *, seed=1, change=None, tilted=False, **campaign) -> Path:
+    """Catalogue, log, lists, known distortion and configuration; the path of the last.
+
+    If `tilted`, errors of the catalogue and of the centroids are correlated.
+    """
     rng = np.random.default_rng(seed)
     folder.mkdir(parents=True)
     stars = sky(rng)
-    table = gaia(rng, stars)
+    table = gaia(rng, stars, CORRELATIONS if tilted else None)
     table = table if change is None else change(table)
     table.write(folder / "catalog.csv")
     log = Table(
@@ -165,16 +183,23 @@ def write(folder: Path, sense: int, *, seed=1, change=None, **campaign) -> Path:
         wcs = header((ra, dec), 70.0 * k + 11, sense, factor)
         x, y = wcs.all_world2pix(stars.seen(date), 1).T
         on = (x > 1) & (x < SIDE) & (y > 1) & (y < SIDE)
-        x, y = np.stack([x[on], y[on]]) + CENTROID * rng.standard_normal((2, on.sum()))
+        errors = CENTROID * np.eye(2)
+        if tilted:
+            mixed = RHO * np.multiply(*TRAILED)
+            errors = np.linalg.cholesky([[TRAILED[0] ** 2, mixed], [mixed, TRAILED[1] ** 2]])
+        x, y = np.stack([x[on], y[on]]) + errors @ rng.standard_normal((2, on.sum()))
         mag = stars.mag[on] - 27.0 + 0.02 * rng.standard_normal(on.sum())
         false = rng.uniform(1, SIDE, (2, 15))
-        Table(
-            {
-                "x": np.append(x, false[0]),
-                "y": np.append(y, false[1]),
-                "mag": np.append(mag, rng.uniform(-12, -7, 15)),
-            }
-        ).write(folder / "lists" / f"e{k}.parquet")
+        columns = {
+            "x": np.append(x, false[0]),
+            "y": np.append(y, false[1]),
+            "mag": np.append(mag, rng.uniform(-12, -7, 15)),
+        }
+        if tilted:
+            columns |= {"x_err": TRAILED[0], "y_err": TRAILED[1], "rho_xy": RHO}
+        Table({name: np.broadcast_to(v, len(columns["x"])) for name, v in columns.items()}).write(
+            folder / "lists" / f"e{k}.parquet"
+        )
         log.add_row((f"e{k}", date, factor, ra, dec))
     log["filter"] = "F606W"
     log.write(folder / "exposures.ecsv")
@@ -263,26 +288,29 @@ def off_truth(run: Path) -> tuple[float, int]:
 
 
 def pulls_of_pairs(run: Path, parity: int) -> np.ndarray:
-    """Pairs' positions less those that the Earth saw, over the stated errors (2, n); no false ones.
+    """Pairs' positions less those that the Earth saw, over the stated errors (2, n)."""
+    pairs = read_matches(run / "pairs", unit="arcsec")
+    off = np.stack([pairs.u, pairs.v]) - positions_seen(run, parity, pairs).T
+    return off / np.stack([pairs.sigma_u, pairs.sigma_v])
+
+
+def positions_seen(run: Path, parity: int, pairs: Matches) -> np.ndarray:
+    """Positions (N, 2) of the pairs' stars that the Earth saw, over the factor of aberration.
 
     On the plane that the run says, by astropy's TAN; u to the west where it is mirrored.
     """
     matching = summary_of(run)["matching"]
-    pairs = read_matches(run / "pairs", unit="arcsec")
     plane = WCS(naxis=2)
     plane.wcs.ctype = ["RA---TAN", "DEC--TAN"]
     plane.wcs.crval, plane.wcs.cdelt = matching["tangent_point"], [1 / 3600, 1 / 3600]
     stars = sky(np.random.default_rng(1))  # the first that the seed of `write` makes
     log = Table.read(run.parent / "exposures.ecsv")
-    out = []
+    out = np.empty((len(pairs), 2))
     for row in log:
-        code = pairs.exposure_names.index(row["exposure"])
-        some = pairs.select(pairs.exposure == code)
-        xi, eta = plane.all_world2pix(stars.seen(row["epoch"])[some.star], 1).T
-        u = (-xi if parity < 0 else xi) / row["vafactor"]
-        off = np.stack([some.u - u, some.v - eta / row["vafactor"]])
-        out.append(off / np.stack([some.sigma_u, some.sigma_v]))
-    return np.concatenate(out, axis=1)
+        here = pairs.exposure == pairs.exposure_names.index(row["exposure"])
+        xi, eta = plane.all_world2pix(stars.seen(row["epoch"])[pairs.star[here]], 1).T
+        out[here] = np.stack([-xi if parity < 0 else xi, eta], axis=1) / row["vafactor"]
+    return out
 
 
 BOTH = pytest.mark.parametrize(
@@ -319,6 +347,51 @@ def test_both_parities_match_and_agree_with_the_truth(tmp_path, parity):
     assert shape["distortion"] == pytest.approx(largest_distortion(), rel=0.01)
     value, free = off_truth(run)
     assert 1e-4 < stats.chi2.sf(value, free) < 1 - 1e-4
+
+
+def whitened(residual, covariance):
+    """Residuals (N, 2) in units of their errors, turned least, without false matches."""
+    value, axes = np.linalg.eigh(covariance)
+    root = axes / np.sqrt(value)[:, None] @ np.swapaxes(axes, 1, 2)
+    z = np.einsum("nij,nj->ni", root, residual)
+    return z[np.hypot(*z.T) < 5]
+
+
+def is_of_unit_covariance(z):
+    square, product = np.mean(z**2), np.mean(z[:, 0] * z[:, 1])
+    error = 4 / np.sqrt(len(z) / len(DATES))  # stars are seen up to five times
+    return abs(square - 1) < error and abs(product) < error
+
+
+@BOTH
+def test_correlated_errors_are_carried_from_the_lists_to_the_posterior(tmp_path, parity):
+    """Ellipses of the catalogue turn with the mirror image, those of centroids with the roll."""
+    config = write(tmp_path / "in", parity, tilted=True)
+    run = staged(config, "match")
+    pairs = read_matches(run / "pairs", unit="arcsec")
+    true = positions_seen(run, parity, pairs)
+    off = np.stack([pairs.u, pairs.v], axis=1) - true
+    assert is_of_unit_covariance(whitened(off, pairs.covariances()))
+    along = off / np.stack([pairs.sigma_u, pairs.sigma_v], axis=1)
+    assert np.mean(np.sign(pairs.rho_uv) * along[:, 0] * along[:, 1]) > 0.4
+    config = write(tmp_path / "columns", parity, tilted=True, sigma="columns")
+    run = staged(config, "match", "fit", "sample")
+    of_catalogue, pairs = pairs, read_matches(run / "pairs", unit="arcsec")
+    fit = load_fit(run / "fit.nc")
+    np.testing.assert_array_equal(pairs.star, of_catalogue.star)
+    added = np.linalg.eigvalsh(pairs.covariances() - of_catalogue.covariances())
+    mixed = RHO * np.multiply(*TRAILED)
+    expected = np.linalg.eigvalsh([[TRAILED[0] ** 2, mixed], [mixed, TRAILED[1] ** 2]])
+    # the distortion changes the size of pixels by some per cent
+    np.testing.assert_allclose(added / PIXEL**2, np.tile(expected, (len(pairs), 1)), rtol=0.1)
+    left = residuals(fit, pairs)
+    # 4 of 5 exposures have frames of their own: 8 of 10 numbers of some 1700 positions
+    assert is_of_unit_covariance(whitened(left, pairs.covariances()))
+    value, free = off_truth(run)
+    assert 1e-4 < stats.chi2.sf(value, free) < 1 - 1e-4
+    posterior = load_posterior(run / "posterior.nc")
+    jitter = posterior.hyper["j"].mean() / PIXEL
+    assert jitter < 0.4 * TRAILED[1]  # nothing is left to be explained
 
 
 def test_a_parity_that_is_given_is_the_only_one(tmp_path):

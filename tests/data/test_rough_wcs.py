@@ -137,6 +137,55 @@ def test_the_matches_are_those_of_a_table():
     assert np.median(off) < 0.01 * SCALE * 2
 
 
+def with_ellipses(seen, catalogue, seed=3):
+    """Detections with SExtractor's errors, and a catalogue with motions and correlated errors."""
+    rng = np.random.default_rng(seed)
+    n, m = len(seen["x"]), len(catalogue)
+    for name, low in (("ERRX2WIN_IMAGE", 1e-4), ("ERRY2WIN_IMAGE", 4e-4)):
+        seen[name] = low * rng.uniform(1, 2, n)
+    product = seen["ERRX2WIN_IMAGE"] * seen["ERRY2WIN_IMAGE"]
+    seen["ERRXYWIN_IMAGE"] = rng.uniform(-0.8, 0.8, n) * np.sqrt(product)
+    catalogue["parallax"], catalogue["parallax_error"] = [1.0, 0.2] * u.mas
+    catalogue["pmra"], catalogue["pmdec"] = rng.normal(0, 5, (2, m)) * u.mas / u.yr
+    for name in ("pmra_error", "pmdec_error"):
+        catalogue[name] = rng.uniform(0.1, 0.3, m) * u.mas / u.yr
+    catalogue["ref_epoch"] = 2016.0
+    names = ("ra", "dec", "parallax", "pmra", "pmdec")
+    root = rng.standard_normal((m, 5, 5))
+    C = root @ np.swapaxes(root, 1, 2)
+    size = np.sqrt(np.einsum("nii->ni", C))
+    for j in range(5):
+        for i in range(j):
+            catalogue[f"{names[i]}_{names[j]}_corr"] = C[:, i, j] / (size[:, i] * size[:, j])
+    return seen, catalogue
+
+
+@pytest.mark.parametrize("centre", [CENTRE, (150.0, 70.0)])
+def test_a_reference_catalogue_gives_the_covariances_of_its_table(centre):
+    """Also about another tangent point, close to the pole, where the axes are turned."""
+    seen, catalogue, _ = field(n=400)
+    seen, catalogue = with_ellipses(seen, catalogue)
+    away = (catalogue["ra"].value - CENTRE[0]) * np.cos(np.radians(CENTRE[1]))
+    catalogue["ra"] = (centre[0] + away / np.cos(np.radians(centre[1]))) * u.deg
+    catalogue["dec"] = catalogue["dec"] + (centre[1] - CENTRE[1]) * u.deg
+    options = {"radius": RADIUS, "wcs": tan_wcs(centre), "epoch": 2024.6, "tangent_point": centre}
+    of_table = match(seen, catalogue, **options)
+    reference = catalog_from_table(catalogue, tangent_point=(centre[0] + 1.5, centre[1] - 0.5))
+    of_reference = match(seen, reference, **options)
+    assert len(of_table) > 250
+    np.testing.assert_array_equal(of_reference.star, of_table.star)
+    C = of_table.covariances()
+    np.testing.assert_allclose(of_reference.covariances(), C, atol=1e-4 * np.abs(C).max())
+    assert np.abs(of_table.rho_uv).max() > 0.5
+    # what the centroids add: their covariance by the WCS, with x to the west
+    bare = {name: v for name, v in seen.items() if not name.startswith("ERR")}
+    alone = match(bare, catalogue, **options).covariances()
+    rows = of_table.row
+    xx, yy, xy = (seen[f"ERR{key}WIN_IMAGE"][rows] for key in ("X2", "Y2", "XY"))
+    centroids = SCALE**2 * np.moveaxis(np.array([[xx, -xy], [-xy, yy]]), 2, 0)
+    np.testing.assert_allclose(C - alone, centroids, atol=3e-3 * centroids.max())
+
+
 def test_a_distortion_larger_than_the_radius_loses_no_corner():
     seen, catalogue, truth = field(n=2000, bend=12.0)  # 2.4 arcsec in the corners
     matches = match(seen, catalogue, radius=RADIUS, wcs=tan_wcs(**ROUGH))

@@ -16,6 +16,7 @@ from bayesdist.data import (
     read_exposures,
     select_motions,
 )
+from bayesdist.data.covariances import without_sizes
 from bayesdist.data.sky import mean_direction, tangent_plane
 from bayesdist.errors import InputError
 from bayesdist.files.tables import read_table
@@ -25,8 +26,7 @@ from bayesdist.kinds.campaign.reference import held_tables
 from bayesdist.kinds.star_lists import StarLists, lists_of
 from bayesdist.model import DistortionModel, LookupTable
 from bayesdist.products.common.document import Document
-
-WITHOUT_PARALLAX = np.array([0, 1, 3, 4])  # of the parameters of a catalogue's correlations
+from bayesdist.utils.arrays import Float
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,26 +220,38 @@ def parities_of(
     return (expected, not expected)
 
 
-def errors_by_star(catalog: ReferenceCatalog, largest_vafactor: float = 1.0) -> StarErrors | None:
+def errors_by_star(
+    catalog: ReferenceCatalog, largest_vafactor: float = 1.0, *, mirrored: bool = False
+) -> StarErrors | None:
     """Errors of the catalogue by star code; None if there are none.
 
-    `largest_vafactor` is the factor that catalogue positions were divided by.  A star in several
-    exposures has one error, because the factors differ by less than 1e-4.
+    `largest_vafactor` is the factor that catalogue positions were divided by, and `mirrored` is
+    True if u of the matches has the opposite sign to that of the catalogue.  A star in several
+    exposures has one error, because the factors differ by less than 1e-4.  Errors of parallaxes,
+    and what other errors have in common with them, are taken as errors of single exposures.
     """
     position = catalog.by_code("sigma_u", "sigma_v")
     if position is None or not position.any():
         return None
     motion = catalog.by_code("sigma_pm_u", "sigma_pm_v")
     epoch = catalog.by_code("epoch")
-    correlations = None
-    if catalog.correlations is not None:
-        n = 2 if motion is None else 4
-        correlations = np.tile(np.eye(n), (len(position), 1, 1))
-        of_both = catalog.correlations[:, WITHOUT_PARALLAX[:, None], WITHOUT_PARALLAX]
-        correlations[catalog.star] = of_both[:, :n, :n]
-    return StarErrors(
-        position / largest_vafactor,
-        None if motion is None else motion / largest_vafactor,
-        None if epoch is None else epoch[:, 0],
-        correlations,
-    )
+    dates = None if epoch is None else epoch[:, 0]
+    if catalog.correlations is None:
+        motion = None if motion is None else motion / largest_vafactor
+        return StarErrors(position / largest_vafactor, motion, dates)
+    sigma, correlations = without_sizes(_without_parallax(catalog.covariances))
+    n = 2 if motion is None else 4
+    sigmas, matrices = np.zeros((len(position), n)), np.tile(np.eye(n), (len(position), 1, 1))
+    sigmas[catalog.star] = sigma[:, :n] / largest_vafactor
+    sign = np.array([-1.0 if mirrored else 1.0, 1.0] * (n // 2))
+    matrices[catalog.star] = correlations[:, :n, :n] * np.outer(sign, sign)
+    return StarErrors(sigmas[:, :2], sigmas[:, 2:] if n == 4 else None, dates, matrices)
+
+
+def _without_parallax(covariances: Float) -> Float:
+    """Covariances (N, 4, 4) of positions and motions, without what parallaxes explain of them."""
+    rest = np.array([0, 1, 3, 4])
+    with_parallax, variance = covariances[:, rest, 2], covariances[:, 2, 2]
+    explained = with_parallax / np.sqrt(np.where(variance > 0, variance, np.inf))[:, None]
+    out = covariances[:, rest[:, None], rest] - explained[:, :, None] * explained[:, None]
+    return np.asarray(out)

@@ -38,6 +38,7 @@ from bayesdist.kinds.campaign.inputs import (
 from bayesdist.kinds.campaign.linear_terms import line_sections
 from bayesdist.kinds.campaign.matched import (
     aberration_term,
+    is_mirrored,
     load_matched_campaign,
     overlap_of,
 )
@@ -201,9 +202,10 @@ class CampaignKind(RunKind[CampaignConfig, Inputs]):
         return inputs.catalog
 
     def star_errors(self, run: Run) -> StarErrors | None:
-        """Errors of the catalogue by star code; None if there are none."""
+        """Errors of the catalogue by star code, along u and v; None if there are none."""
         inputs: Inputs = run.inputs
-        return errors_by_star(inputs.catalog, inputs.largest_vafactor)
+        mirrored = is_mirrored(run.match_facts)
+        return errors_by_star(inputs.catalog, inputs.largest_vafactor, mirrored=mirrored)
 
     def filter(self, run: Run) -> str:
         """Filter of the exposures."""

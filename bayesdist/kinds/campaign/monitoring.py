@@ -73,7 +73,7 @@ def fit_new_exposures(release: Run, new: Path) -> tuple[Matches, NewFit, tuple[s
         compute=config.resources(),
         scatter=dict(zip(scatter.kinds, np.sqrt((scatter.tau**2).mean(axis=0)), strict=True)),
     )
-    with_centroids = config.campaign.sigma == "columns"
+    with_centroids = cast(CampaignConfig, config).campaign.sigma == "columns"
     of_catalogue = _catalogue_errors(pairs, run, with_centroids=with_centroids)
     if of_catalogue is not None:
         is_same = run is not None and _catalogue_of(run) == _catalogue_of(release.directory)
