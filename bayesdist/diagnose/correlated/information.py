@@ -159,15 +159,26 @@ class Information:
         return np.asarray(np.einsum("ck,abkl,cl->cab", cells.phi, within, cells.phi, optimize=True))
 
     def leverage(self, cells: GroupCells) -> Float:
-        """Fraction (C, 2) of its residual that a star in each cell absorbs, on each axis."""
-        return _leverage(cells, self.position_covariance(cells))
+        """Fraction (C, 2) of its residual that a star in each cell absorbs, on each axis.
+
+        If errors are correlated between u and v, it is the mean of both axes.
+        """
+        return self._leverage(cells, self.position_covariance(cells))
+
+    def _leverage(self, cells: GroupCells, position: Float) -> Float:
+        """Leverage (C, 2) for a covariance (C, 2, 2) of positions."""
+        products = cells.curvature * position / cells.count[:, None, None]
+        out = np.einsum("caa->ca", products)
+        if self.sums.n_correlated:
+            out = np.repeat(products.sum(axis=(1, 2))[:, None] / 2, 2, axis=1)
+        return np.asarray(np.clip(out, 0.0, 1 - MIN_FREE))
 
     def squared_scores(self) -> SquaredScores:
         """Sums over the stars of products of their scores, and the expectation of these sums."""
         unbiased, jackknife, products = [], [], np.zeros(3)
         for cells in self.groups():
             position = self.position_covariance(cells)
-            free = 1 - _leverage(cells, position)
+            free = 1 - self._leverage(cells, position)
             product = free[:, :, None] * free[:, None, :]
             unbiased.append(cells.squares / np.sqrt(product))
             jackknife.append(cells.squares / product)
@@ -186,12 +197,6 @@ class Information:
         )
 
 
-def _leverage(cells: GroupCells, position: Float) -> Float:
-    """Leverage (C, 2) for a covariance (C, 2, 2) of positions."""
-    per_star = np.einsum("caa->ca", cells.curvature) / cells.count[:, None]
-    return np.asarray(np.clip(per_star * np.einsum("caa->ca", position), 0.0, 1 - MIN_FREE))
-
-
 @dataclass(frozen=True, eq=False)
 class CellSums(Sums):
     """Sums over the stars of each group and cell."""
@@ -202,6 +207,7 @@ class CellSums(Sums):
     # minus its second derivatives uu, uv, vv, and products of the gradients uu, uv, vv
     sums: Float
     position: Float  # (chips, C, 3) number of stars and sums of their scaled positions X and Y
+    n_correlated: int  # number of stars in parts with errors that are correlated between u and v
 
     BY_GROUP = ("sums",)
     SAME = ("side",)
@@ -269,7 +275,8 @@ def cell_sums(
         position[chip, :, 0] += sums[g, :, 0]
         for k, z in ((1, stars.X), (2, stars.Y)):
             position[chip, :, k] += np.bincount(code[rows], z[rows], minlength=C)
-    return CellSums(stars.groups, side, sums, position)
+    n_correlated = len(stars) if stars.is_correlated else 0
+    return CellSums(stars.groups, side, sums, position, n_correlated)
 
 
 @dataclass(frozen=True, eq=False)

@@ -452,7 +452,7 @@ def exposure_field_test(sample: ScoredSample) -> Outcome | None:
     if len({block.exposure for block in sample.blocks}) < 2:
         return None
     scores = ExposureScores(
-        sample.X, sample.Y, *sample.on_detector, sample.chip, sample.exposure, sample.star
+        sample.X, sample.Y, *sample.uncorrelated, sample.chip, sample.exposure, sample.star
     )
     chips = exposure_products(scores, [chip.size for chip in sample.model.chips])
     if not chips:

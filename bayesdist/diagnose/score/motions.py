@@ -119,9 +119,16 @@ def _of_true_matches(sample: ScoredSample) -> tuple[Float, Float]:
     if sample.mixture is None:
         return sample.whole_score, sample.curvature
     near = (sample.residual**2 < FARTHEST**2 * sample.variance).all(axis=0) & sample.used
-    score = near * sample.residual / sample.variance / np.sqrt(1.0 - sample.leverage)
-    u, v = near / sample.variance
-    return score, np.stack([u, np.zeros_like(u), v])
+    free = np.sqrt(1.0 - sample.leverage)
+    if sample.covariance is None:
+        u, v = near / sample.variance
+        return near * sample.residual / sample.variance / free, np.stack([u, np.zeros_like(u), v])
+    uu, vv = sample.variance
+    uv = sample.covariance
+    inverse = near * np.stack([vv, -uv, uu]) / (uu * vv - uv**2)
+    u, v = sample.residual
+    score = np.stack([inverse[0] * u + inverse[1] * v, inverse[1] * u + inverse[2] * v])
+    return score / free, inverse
 
 
 def motion_outcome(data: StarResiduals, unit: str, family: Family) -> Outcome | None:

@@ -388,7 +388,7 @@ def ring_test(sample: ScoredSample) -> Outcome | None:
 
 def _chips(sample: ScoredSample) -> Iterator[_Chip]:
     """Iterate over the chips with enough detections, with their scores."""
-    score = sample.on_detector[0].T
+    score = sample.uncorrelated[0].T
     cell = cell_index(sample.X, sample.Y, (RING_BINS, RING_BINS))
     for code, chip in enumerate(sample.model.chips):
         rows = np.flatnonzero(sample.used & (sample.chip == code))

@@ -250,15 +250,33 @@ class _Together:
         )
         G_uu, G_vv = np.abs(uu) * of_families(x[0] ** 2), np.abs(vv) * of_families(x[1] ** 2)
         G_uv = np.sqrt(np.abs(uu * vv)) * of_families(x[0] * x[1])
-        leverage = projection.leverage[:, block.rows, None] + np.stack(
-            [np.where(uu > 0, G_uu, 0.0), np.where(vv > 0, G_vv, 0.0)]
-        )
-        leverage = np.minimum(leverage, LARGEST_LEVERAGE)
+        trace, norm2 = G_uu + G_vv, G_uu**2 + 2 * G_uv**2 + G_vv**2
+        by_step = np.stack([np.where(uu > 0, G_uu, 0.0), np.where(vv > 0, G_vv, 0.0)])
+        if sample.covariance is not None:
+            squares = [of_families(x[a] * x[b]) for a, b in ((0, 0), (0, 1), (1, 1))]
+            trace, norm2 = _trace_and_norm(squares, (uu, uv, vv))
+            by_step = np.broadcast_to(trace / 2, (2, *trace.shape))
+        leverage = np.minimum(projection.leverage[:, block.rows, None] + by_step, LARGEST_LEVERAGE)
         g = g / (1.0 - leverage) ** GIVEN_BACK
         family = np.repeat(np.arange(len(self.starts)), np.diff([*self.starts, len(self.step)]))
         psi = g[0][:, family] * x[0] + g[1][:, family] * x[1]
-        lost = (leverage[0] * G_uu + leverage[1] * G_vv).sum(axis=0)
-        return psi, np.stack([G_uu + G_vv, np.sqrt(G_uu**2 + 2 * G_uv**2 + G_vv**2)]), lost
+        if sample.covariance is None:
+            lost = (leverage[0] * G_uu + leverage[1] * G_vv).sum(axis=0)
+        else:
+            lost = (leverage[0] * trace).sum(axis=0)
+        return psi, np.stack([trace, np.sqrt(norm2)]), lost
+
+
+def _trace_and_norm(X: Sequence[Float], W: Sequence[Float]) -> tuple[Float, Float]:
+    """Trace of X W, and that of its square, for symmetric matrices with elements uu, uv, vv.
+
+    They are at least zero; curvatures W of detections between true and false matches may be
+    negative.
+    """
+    (X_uu, X_uv, X_vv), (uu, uv, vv) = X, W
+    first, last = X_uu * uu + X_uv * uv, X_uv * uv + X_vv * vv
+    square = first**2 + 2 * (X_uu * uv + X_uv * vv) * (X_uv * uu + X_vv * uv) + last**2
+    return np.maximum(first + last, 0.0), np.maximum(square, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -324,7 +342,11 @@ class Projection:
 
     @cached_property
     def leverage(self) -> Float:
-        """Fraction (2, N) of the noise of each detection that the fit follows, along u and v."""
+        """Fraction (2, N) of the noise of each detection that the fit follows, along u and v.
+
+        If errors are correlated, it is the mean of both axes: half the trace of the product of the
+        covariance of the model's position with the information of the detection.
+        """
         sample = self.sample
         out = np.zeros((2, len(sample)))
         for block in sample.blocks:
@@ -334,6 +356,11 @@ class Projection:
                 covariance = block.derivative[axis] @ joint @ block.derivative[axis].T
                 follows = np.einsum("kn,kn->n", phi, covariance @ phi)
                 out[axis, block.rows] = follows * sample.curvature[2 * axis, block.rows]
+            if sample.covariance is not None:
+                covariance = block.derivative[0] @ joint @ block.derivative[1].T
+                mixed = np.einsum("kn,kn->n", phi, covariance @ phi)
+                crossed = mixed * sample.curvature[1, block.rows]
+                out[:, block.rows] = out[:, block.rows].mean(axis=0) + crossed
         return np.clip(out, 0.0, LARGEST_LEVERAGE)
 
     @cached_property

@@ -73,8 +73,8 @@ class ScoredSample:
     blocks: tuple[DetectionBlock, ...] = ()  # empty if the model's derivatives are not needed
     motion: Float | None = None  # (2, N) proper motions along u and v, in the unit of u, v per year
     motion_sigma: Float | None = None  # (2, N) their standard errors, if the table has them
-    # (2, N) leverage: fraction of the noise of each detection that the fit follows, along u and v;
-    # 0 if it has not been computed
+    # (2, N) leverage: fraction of the noise of each detection that the fit follows, along u and v
+    # or, if errors are correlated, their mean on both; 0 if it has not been computed
     leverage: Float | float = 0.0
     from_nominal: Float | None = None  # (2, N) data minus nominal positions, if the table has them
     match_radius: float | None = None  # stated radius within which the stars were matched
@@ -135,6 +135,21 @@ class ScoredSample:
         matrix = np.stack([np.stack([uu, uv], -1), np.stack([uv, vv], -1)], -2)
         score = np.einsum("nba,bn->na", self.turn, self.whole_score)
         return score, np.einsum("nba,nbc,nca->na", self.turn, matrix, self.turn)
+
+    @cached_property
+    def uncorrelated(self) -> tuple[Float, Float]:
+        """`on_detector` along axes on which the scores are uncorrelated, summed over the stars.
+
+        These are the axes of the polynomials if the errors are not correlated.
+        """
+        score, curvature = self.on_detector
+        if self.covariance is None:
+            return score, curvature
+        axes = np.linalg.eigh(score.T @ score)[1]
+        uu, uv, vv = self.curvature
+        matrix = np.stack([np.stack([uu, uv], -1), np.stack([uv, vv], -1)], -2)
+        turn = self.turn @ axes
+        return score @ axes, np.einsum("nba,nbc,nca->na", turn, matrix, turn)
 
     def blocks_by(self, name: str) -> list[list[DetectionBlock]]:
         """Blocks grouped by the attribute `name`: 'exposure' or 'frame_exposure'."""
