@@ -142,3 +142,38 @@ def test_the_scale_changes_while_an_exposure_lasts(exptime):
     # to first order in the exposure's part of an orbit: an arc is longer than its chord
     assert scale_error(exptime) == pytest.approx(seen, rel=0.02 + (exptime / PERIOD) ** 2 * 2)
     assert scale_error(exptime) < scale_error(None) == pytest.approx(np.std(factor[0]), rel=0.01)
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_errors_of_stars_are_within_those_of_their_positions_with_parallax(rng, mirrored):
+    """Of a catalogue with all correlations, at any date, whatever the parallax factors are."""
+    n = 30
+    root = rng.standard_normal((n, 5, 5))
+    C = root @ np.swapaxes(root, 1, 2)
+    sigma = np.sqrt(np.einsum("nii->ni", C))
+    names = ("sigma_u", "sigma_v", "sigma_parallax", "sigma_pm_u", "sigma_pm_v")
+    zero = np.zeros(n)
+    catalog = ReferenceCatalog(
+        zero, zero, pm_u=zero, pm_v=zero, parallax=zero, epoch=2016.0, unit="mas",
+        tangent_point=(0.0, 0.0), star=2 * np.arange(n),
+        correlations=C / (sigma[:, :, None] * sigma[:, None]),
+        **dict(zip(names, sigma.T, strict=True)),
+    )  # fmt: skip
+    errors = errors_by_star(catalog, mirrored=mirrored)
+    sign = np.array([-1.0 if mirrored else 1.0, 1.0])
+    for epoch in (2000.0, 2016.0, 2030.5):
+        dt, (east, north) = epoch - 2016.0, rng.uniform(-1, 1, 2)
+        A = np.array([[1, 0, east, dt, 0], [0, 1, north, 0, dt]])
+        whole = np.outer(sign, sign) * (A @ C @ A.T)
+        part = errors.covariances_at(catalog.star, np.full(n, epoch))
+        left = np.linalg.eigvalsh(whole - part)
+        # the parallax is one number: what it adds lies on a line
+        np.testing.assert_allclose(left[:, 0], 0.0, atol=1e-9 * np.abs(whole).max())
+    # nothing is taken off where parallaxes are independent of the other errors
+    free = catalog.correlations.copy()
+    free[:, 2] = free[:, :, 2] = np.eye(5)[2]
+    part = errors_by_star(replace(catalog, correlations=free)).covariances_at(
+        catalog.star, np.full(n, 2020.0)
+    )
+    A = np.array([[1, 0, 0, 4, 0], [0, 1, 0, 0, 4]])
+    np.testing.assert_allclose(part, A @ C @ A.T, rtol=1e-9)

@@ -134,6 +134,21 @@ def test_the_influence_of_stars_has_their_correlations():
         np.testing.assert_allclose(given, expected, atol=1e-9 * np.abs(expected).max())
 
 
+def test_errors_contained_in_all_matches_are_the_largest_along_one_direction(rng):
+    """No match of a star has a smaller error along any direction, and one is as large along one."""
+    n, code = 200, np.arange(200) % 40
+    root = rng.standard_normal((n, 2, 2))
+    C = root @ np.swapaxes(root, 1, 2) + 0.01 * np.eye(2)
+    C[code == 7] = C[7]
+    place = np.arange(float(n))
+    matches = Matches(place, place, place, place, star=code).with_covariances(C)
+    found = StarErrors.contained_in(matches).covariances(code, 1).reshape(n, 2, 2)
+    left = np.array([np.linalg.eigvalsh(a - b)[0] for a, b in zip(C, found, strict=True)])
+    smallest = np.array([left[code == star].min() for star in range(40)])
+    np.testing.assert_allclose(smallest, 0.0, atol=1e-9)
+    np.testing.assert_allclose(found[7], C[7])
+
+
 def test_impossible_correlations_are_refused():
     matches, fit, code, catalogue, _ = correlated()
     matches = matches.with_columns(star=code)
