@@ -67,6 +67,7 @@ if TYPE_CHECKING:
 
 Bins = tuple[int, int]
 
+INSIDE = 0.5  # of the match radius: matches that end within it may have been cut at another radius
 SHOWN = "shown"  # name of the partition that is plotted as a map of mean residuals
 
 log = logging.getLogger("bayesdist")
@@ -180,15 +181,18 @@ class Diagnostics:
     @property
     def checks_of_input(self) -> tuple[Check, ...]:
         """Checks of the fit and its matching, taking the results of the tests into account."""
-        findings = [
-            test.name for test in self.score_tests if test.significant and test.held_by != "noise"
-        ]
+        findings = {
+            # sizes per year are not comparable, and are taken to explain everything
+            test.name: test.size if test.unit == self.misfit.unit else np.inf
+            for test in self.score_tests
+            if test.significant and test.held_by != "noise"
+        }
         if any(misfit.significant for misfit in self.misfits):
-            findings.append("structure in the residuals")
+            findings["structure in the residuals"] = self.misfit.structure
         if self.correlated is not None and self.correlated.facts.get("exposures_outlying"):
-            findings.append("exposures that deviate far more than the others")
+            findings["exposures that deviate far more than the others"] = np.inf
         if self.majority:
-            findings.append("more false than true pairs")
+            findings["more false than true pairs"] = np.inf
         return self.chi_square.check(findings), *self.input_checks
 
     @property
@@ -459,13 +463,31 @@ def diagnose_fit(
         ),
         sample=sample,
         chi_square=ChiSquare(
-            fit.chi2, fit.dof, in_circle, explained_by_false_matches(posterior, sigma)
+            fit.chi2,
+            fit.dof,
+            in_circle,
+            explained_by_false_matches(posterior, sigma),
+            sigma if eliminated is None else None,
+            "" if match_radius is None else _radius_doubt(sample, match_radius),
         ),
         input_checks=tuple(checks),
         dates=dates_of(stars if stars.in_memory else table),
         majority=majority,
         epoch_shift=epoch_shift(table, fit),
         centroid=centroid,
+    )
+
+
+def _radius_doubt(sample: StarSample, match_radius: float) -> str:
+    """Clause on a match radius that no residual comes near; empty if one does."""
+    largest = float(np.hypot(*sample.residual.T).max(initial=0.0))
+    if largest > INSIDE * match_radius:
+        return ""
+    unit = sample.table.unit
+    return (
+        f"the match radius is stated as {match_radius:.3g} {unit}, and no residual is larger than "
+        f"{largest:.3g}: if the matches were cut there, their errors are wrong, and "
+        "outliers.match_radius has to be that radius"
     )
 
 

@@ -53,11 +53,13 @@ MIN_EXPECTED = 0.5  # with fewer expected matches, their absence is not signific
 MOST_TESTS = 100  # upper limit to the number of score tests of a run
 BEYOND = (0, 3)  # numbers of stars that may be beyond a radius: the edge need not be sharp
 INSIDE = 0.9  # of the stated radius: beyond this, matches count as ending there
-CLEAR = 4.5  # errors beyond which a match is clearly false, if errors are not larger than quoted
+# errors beyond which most matches are false, if errors are not larger than quoted: of the true ones
+# 0.2 %, and their tail only conceals an end
+CLEAR = 3.5
 MIN_FALSE = 8
 SHARE = 0.9  # fraction of the clearly false matches that defines their outer end
-# Limit to the median excess of their squared distances over the largest squared distance of true
-# matches, in units of the latter. For Student's t with four degrees of freedom it is 0.4.
+# Limit to the median excess of their squared residuals over the largest squared residual of true
+# matches, in units of the latter. For Student's t with four degrees of freedom it is 0.5.
 FAR = 1.5
 # Without nominal positions, residuals refer to the solution instead. NEAR: how far beyond the
 # stated radius they may extend, in radii. STRAY: fraction of the false matches that may do so.
@@ -149,6 +151,7 @@ class _FalseMatches:
     """Distances of clearly false matches from the positions at which they were searched."""
 
     square: Float  # (m,) squared distances, ascending
+    residual2: Float  # (m,) squared residuals, ascending
     hidden2: float  # squared distance within which true matches outnumber them
     gaussian: bool  # True if the likelihood assumes a Gaussian distribution of their distances
 
@@ -163,8 +166,9 @@ class _FalseMatches:
         clear = residual > CLEAR * sigma
         if clear.sum() < MIN_FALSE:
             return None
-        square = np.sort(distance[clear]) ** 2
-        return cls(square, min(float(np.median((CLEAR * sigma) ** 2)), square[-1] / 2), gaussian)
+        square, residual2 = (np.sort(size[clear]) ** 2 for size in (distance, residual))
+        hidden2 = min(float(np.median((CLEAR * sigma) ** 2)), square[-1] / 2)
+        return cls(square, residual2, hidden2, gaussian)
 
     @property
     def end2(self) -> float:
@@ -190,19 +194,38 @@ class _FalseMatches:
         """Probability of the observed number beyond the end for a uniform density within `radius`.
 
         If the distances are Gaussian, or a long tail of those of true matches, their number also
-        falls off without a cut; then the larger of both probabilities is returned.
+        falls off without a cut; then the larger of both probabilities is returned.  Tails of true
+        matches are those of normal distributions of various widths, whose squared residuals are
+        mixtures of exponentials.  They are compared with the lightest of these tails, a single
+        exponential, by the largest distance and by the total time on test, which a mixture can
+        only make smaller (Barlow and Proschan 1975, Statistical Theory of Reliability and Life
+        Testing, chapter 3).
         """
         if self.end2 > (INSIDE * radius) ** 2 or self.end2 <= self.hidden2:
             return 1.0
         outer, beyond, middle2 = self.numbers
         share = (radius**2 - self.end2) / (radius**2 - middle2)
         even = float(special.bdtr(beyond, outer + beyond, share))
-        over = self.square.clip(self.hidden2) - self.hidden2
+        over = self.residual2.clip(self.hidden2) - self.hidden2
         if not self.gaussian and np.median(over) > FAR * self.hidden2:
             return even
-        # squared Gaussian distances are exponential; other distributions have longer tails
-        largest = -np.expm1(-over[-1] / max(float(over.mean()), 1e-300))
-        return max(even, float(largest ** len(over)))
+        return max(even, _level_then_steep(self.residual2[1:] - self.residual2[0]))
+
+
+def _level_then_steep(values: Float) -> float:
+    """Probability that ascending values (m,) are exponential, against an even density that ends.
+
+    Each partial sum of the spacings, multiplied by the number of values above them, is uniformly
+    distributed relative to the total if the values are exponential.  The sum of these is compared
+    with its normal approximation, whose tail is wider than the exact one.
+    """
+    n = len(values)
+    spacings = np.diff(values, prepend=0.0) * np.arange(n, 0, -1)
+    partial_sums = np.cumsum(spacings)
+    if partial_sums[-1] <= 0:
+        return 1.0
+    above = float(partial_sums[:-1].sum() / partial_sums[-1]) - (n - 1) / 2
+    return float(special.ndtr(-above / np.sqrt((n - 1) / 12)))
 
 
 def _weights(sample: ScoredSample) -> Float:

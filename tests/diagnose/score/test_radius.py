@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from bayesdist.diagnose.score.truncation import _level_then_steep
 from bayesdist.infer import OutlierMixture
 from bayesdist.utils.checks import EITHER
 
-from .shaped import SIGMA, examined, gaussian, nominal_within, scene, student, unequal
+from .shaped import SIGMA, examined, gaussian, nominal_within, scene, student, true_map, unequal
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -80,10 +81,35 @@ def test_radii_that_are_right_are_not_doubted(model):
 
 @pytest.mark.parametrize("noise", [gaussian, student, unequal])
 def test_tails_of_the_noise_do_not_end_at_a_radius(noise):
-    """Where no match is false, and the radius is fifty errors."""
+    """Where no match is false, and the radius is fifty errors, also about nominal positions."""
     for seed in range(3):
         matches = scene(np.random.default_rng(seed), 2000, noise=noise, false=0.0)
         assert at_radius(matches, "uniform", 50 * SIGMA).p_value > 1e-3
+        off = true_map(matches.x, matches.y) + np.array([4 * SIGMA, 0.0])
+        about = matches.with_columns(u_nominal=off[:, 0], v_nominal=off[:, 1])
+        assert at_radius(about, "uniform", 50 * SIGMA).p_value > 1e-3
+
+
+def test_a_cut_about_positions_that_are_off_is_found_although_it_is_blurred():
+    """Nominal positions are off by 1.5 errors, and are not given."""
+    n_found = 0
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        matches, _ = nominal_within(rng, 2000, 0.25, sigma=0.04, off=0.06, false=0.2)
+        blind = matches.with_columns(u_nominal=None, v_nominal=None)
+        n_found += at_radius(blind, "uniform", 1.0).significant
+    assert n_found >= 4
+
+
+def test_level_then_steep_is_uniform_for_exponentials_and_never_small_for_their_mixtures(rng):
+    exponential = np.sort(rng.exponential(size=(4000, 30)))
+    mixed = np.sort(rng.exponential(size=(4000, 30)) * rng.gamma(2.0, size=(4000, 30)))
+    for p in (0.5, 0.1, 0.01):
+        chance = np.mean([_level_then_steep(values) < p for values in exponential])
+        assert chance == pytest.approx(p, abs=4 * np.sqrt(p * (1 - p) / 4000))
+        assert np.mean([_level_then_steep(values) < p for values in mixed]) < 0.6 * p
+    even = np.sort(rng.uniform(size=(100, 100)))
+    assert np.median([_level_then_steep(values) for values in even]) < 1e-7
 
 
 def test_false_matches_with_a_scatter_of_their_own_are_what_a_gaussian_says():
