@@ -17,6 +17,9 @@ from bayesdist.plugin import SELECTION
 from tests import ALONE
 from tests.reduced import FULL
 
+# files whose tasks go to workers
+ON_WORKERS = ("tests.infer.stars.test_cluster", "tests.kinds.selfcal.infer.test_cluster")
+
 if not ALONE:
     kernel.set_threads(1)
 
@@ -46,6 +49,24 @@ def rng() -> np.random.Generator:
 def full() -> bool:
     """Whether the statistical suites run at full size (BAYESDIST_FULL=1) or reduced."""
     return FULL
+
+
+@pytest.fixture(scope="module")
+def one_thread() -> Iterator[None]:
+    """Small data on a busy machine: waiting for a second thread costs more than it gives."""
+    before = kernel.get_threads()
+    kernel.set_threads(1)
+    yield
+    kernel.set_threads(before)
+
+
+@pytest.fixture(scope="module")
+def forked_workers() -> Iterator[None]:
+    """Workers of Dask start in no time."""
+    from tests.infer.workers import forked  # dask, which other tests do not need
+
+    with forked(*ON_WORKERS):
+        yield
 
 
 @pytest.fixture(autouse=True)
@@ -94,7 +115,7 @@ def pytest_collection_finish() -> None:
 
 
 # folders whose files look at the same thing, which is long in the making
-TOGETHER = ("tests/campaign/", "tests/report/", "tests/app/selfcal/", "tests/app/campaign/")
+TOGETHER = ("tests/campaign/", "tests/report/", "tests/kinds/selfcal/runs/", "tests/app/campaign/")
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -32,6 +32,7 @@ from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.errors import InputError, required
 from bayesdist.infer import LinearFit, Posterior, Solution
 from bayesdist.infer.equations.scaled import one_thread
+from bayesdist.infer.solution.transforms import gauge_free, gauge_free_matrix
 from bayesdist.model import Chip
 from bayesdist.model.grid import DEFAULT_GRID, mesh
 from bayesdist.utils.arrays import Float
@@ -433,8 +434,6 @@ def _relative(
     settings: EvaluationSettings,
 ) -> UncertaintyMap:
     """Uncertainty of relative positions on a chip, including structure that the model omits."""
-    from bayesdist.infer.selfcal.sky_moves import gauge_free, gauge_free_matrix
-
     local, correlated = None, diagnostics.correlated
     if correlated is not None and correlated.structure:
         S = gauge_free_matrix(solution.model, np.asarray(solution.mean, float), null)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal
+from typing import Literal, Protocol
 
 import numpy as np
 
@@ -61,9 +61,6 @@ from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.checks import EITHER, Check, warnings_of
 from bayesdist.utils.quantities import Number, Random, takes, value_in
 from bayesdist.utils.streams import assessment_rng, restarted
-
-if TYPE_CHECKING:
-    from bayesdist.infer.selfcal import SelfCalibrationMode
 
 Bins = tuple[int, int]
 
@@ -218,6 +215,31 @@ class Diagnostics:
             verdict = self.periods.verdict.rstrip(".")
             out.append(Check("Periods", "Differences of periods", level="warn", sentence=verdict))
         return tuple(out)
+
+
+class FittedStars(Protocol):
+    """Diagnostics of a solution that includes the positions of its stars.
+
+    They replace the general diagnostics, which take the positions as known.
+    """
+
+    def misfits(self) -> tuple[Misfit, ...]:
+        """Structure in the residuals, per chip; a single item if the chips share stars."""
+
+    def absorbed(self, rows: Int) -> Float:
+        """Fraction (N,) of the variance of detections that the fitted positions absorb.
+
+        Parameters
+        ----------
+        rows : ndarray of int, shape (N,)
+            Rows of the detections in the fitted matches.
+        """
+
+    def discrepancy(self, *, rng: np.random.Generator, priors: DiscrepancyPriors) -> Discrepancy:
+        """Correlated errors beyond the model."""
+
+    def score_tests(self, stars: Matches) -> tuple[ScoreTest, ...]:
+        """Score tests of the residuals; `stars` are the fitted matches."""
 
 
 @takes(matches=Matches, fit=LinearFit, compute=Compute)
@@ -379,7 +401,7 @@ def diagnose_fit(
     shards: Shards,
     table: Matches,
     *,
-    eliminated: SelfCalibrationMode | None,
+    eliminated: FittedStars | None,
     centroid: MagnitudeErrors | Literal["residuals"] | None,
     known: bool,
     match_radius: float | None,
@@ -403,8 +425,8 @@ def diagnose_fit(
         The same stars, for passes over the data.
     table : Matches
         Evenly spread sample of the stars, or all of them.
-    eliminated : SelfCalibrationMode or None
-        Solution including the positions of stars, if these were fitted.
+    eliminated : FittedStars or None
+        Diagnostics with the positions of stars eliminated, if these were fitted.
     centroid : MagnitudeErrors, 'residuals' or None
         Centroid errors, if the fit estimated them; with 'residuals' they are the scatter of the
         residuals.
@@ -425,10 +447,8 @@ def diagnose_fit(
     if eliminated is None:
         misfits = _misfits(fit, stars, partitions, sums, shown)
     else:
-        from bayesdist.diagnose.selfcal.tests import dithered_misfit
-
-        misfits = (dithered_misfit(eliminated),)
-        sample = replace(sample, taken=_taken(eliminated, sample.table.row))
+        misfits = eliminated.misfits()
+        sample = replace(sample, taken=eliminated.absorbed(sample.table.row))
     if centroid == "residuals":
         centroid = centroid_scatter(sample, n_params=model.n_params)
     sigma, pair_word = survey.reference_sigma, "pairs" if rows == "stars" else rows
@@ -551,16 +571,6 @@ def misfits_of(
     return tuple(out)
 
 
-def _taken(eliminated: SelfCalibrationMode, rows: Int) -> Float:
-    """Fraction (N,) of the variance of detections that fitted positions of stars absorb."""
-    from bayesdist.diagnose.selfcal.eliminated import taken_by_stars
-
-    problem_rows = eliminated.problem.rows
-    fraction = np.zeros(max(int(problem_rows.max(initial=-1)), int(rows.max(initial=-1))) + 1)
-    fraction[problem_rows] = taken_by_stars(eliminated)
-    return fraction[rows]
-
-
 @one_thread
 def diagnose_posterior(
     found: Diagnostics,
@@ -578,7 +588,7 @@ def diagnose_posterior(
     exposures: bool,
     settling: Settling | None,
     catalogue: StarErrors | None,
-    eliminated: SelfCalibrationMode | None,
+    eliminated: FittedStars | None,
     periods: PeriodSettings | None,
 ) -> Diagnostics:
     """Add estimates of correlated errors, and tests, to the diagnostics of a posterior.
@@ -625,13 +635,8 @@ def diagnose_posterior(
     in_memory = stars if stars.in_memory else None
     shared = None
     if eliminated is not None:
-        from bayesdist.diagnose.selfcal.correlated import selfcal_discrepancy
-        from bayesdist.diagnose.selfcal.tests import selfcal_score_tests
-
-        estimated = selfcal_discrepancy(eliminated, rng=restarted(rng), priors=discrepancy)
-        tests = selfcal_score_tests(
-            eliminated, mag=stars.mag, colour=stars.colour, epoch=stars.epoch
-        )
+        estimated = eliminated.discrepancy(rng=restarted(rng), priors=discrepancy)
+        tests = eliminated.score_tests(stars)
     else:
         estimated = estimate_discrepancy(
             shards,

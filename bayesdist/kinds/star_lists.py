@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -15,10 +15,12 @@ from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.plane import ARCSEC
 from bayesdist.data import Detections, StarCuts, read_star_lists
 from bayesdist.errors import InputError
-from bayesdist.infer.selfcal.prior import Start
 from bayesdist.model import Chip
 from bayesdist.products.common.document import Choice, Document
 from bayesdist.utils.arrays import Bool, Float, Int
+
+# positions (N, 2) of pixels x, y (N,) on the chip of a number
+Start = Callable[[Float, Float, int], Float]
 
 OFF_CHIP = 0.02  # fraction of a list's detections tolerated beyond the edge of a chip
 EDGE = 1.0  # pixels: half a pixel to the edge, and half for lists that count from 0

@@ -7,7 +7,6 @@ import json
 import pytest
 
 from bayesdist.app.config import installed_kinds, load_config, load_requirements, parse_config
-from bayesdist.app.config.errors import INSTEAD, RENAMED
 from bayesdist.errors import ConfigError, InputError
 from bayesdist.infer import Compute
 from tests.app.support import config_text, write_config
@@ -382,14 +381,17 @@ def test_sections_of_another_kind_are_refused_with_its_name(kind):
         assert error.where == f"c.toml: {name}" and error.do.startswith(("leave it out", "set"))
 
 
-@pytest.mark.parametrize(("kind", "path"), sorted(INSTEAD))
+@pytest.mark.parametrize(("kind", "path"), [(k, path) for k in KINDS for path in KINDS[k].instead])
 def test_what_to_set_in_place_of_a_key_of_another_kind(kind, path):
     section, _, key = path.partition(".")
     content = {key: {}} if key else {"any": 1}
     if section == "model":
         content |= {"order": 2}
     error = refusal(of_kind(kind, **{section: content}))
-    assert error.do == INSTEAD[kind, path]
+    assert error.do == KINDS[kind].instead[path]
+
+
+RENAMED = {path: name for kind in KINDS.values() for path, name in kind.renamed.items()}
 
 
 @pytest.mark.parametrize("path", sorted(RENAMED))

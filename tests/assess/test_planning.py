@@ -6,7 +6,6 @@ from scipy import stats
 
 from bayesdist.assess import Requirement, UserTerm, check_requirements
 from bayesdist.assess.model import error_model
-from bayesdist.assess.planning.dithers import further_dithers
 from bayesdist.assess.planning.futures import (
     MOST,
     TRUTHS,
@@ -17,23 +16,24 @@ from bayesdist.assess.planning.futures import (
     exposures_needed,
     with_more_data,
 )
-from bayesdist.diagnose.selfcal.eliminated import (
-    AddedColumns,
-    EvenStars,
-    eliminated,
-    scores_of_detections,
-)
 from bayesdist.infer import fit_linear
 from bayesdist.infer.compare.planning import (
     exposure_content,
     exposure_information,
     with_information,
 )
-from bayesdist.infer.selfcal.mode import of_first
+from bayesdist.kinds.selfcal.diagnose.eliminated import (
+    AddedColumns,
+    EvenStars,
+    eliminated,
+    scores_of_detections,
+)
+from bayesdist.kinds.selfcal.infer.mode import of_first
+from bayesdist.kinds.selfcal.patterns.dithers import further_dithers
 from bayesdist.model.alignment import mean_squares
-from tests.diagnose.correlated.test_selfcal import solution_of
 from tests.infer.compare.test_planning import SIGMA, model_of, stars
-from tests.infer.selfcal.fields import field
+from tests.kinds.selfcal.diagnose.test_correlated import solution_of
+from tests.kinds.selfcal.infer.fields import field
 from tests.reduced import case_in_full
 
 

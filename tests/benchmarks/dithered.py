@@ -13,9 +13,9 @@ import numpy as np
 from astropy.wcs import WCS
 from numpy.typing import NDArray
 
+from bayesdist.kinds.selfcal.patterns.exposures import dither_pattern
 from bayesdist.model import Chip, DistortionModel
-from bayesdist.simulate.dithers import dither_pattern
-from tests.dithered_fields import DitheredField, simulate_dithers, smooth_distortion
+from tests.kinds.selfcal.dithered_fields import DitheredField, simulate_dithers, smooth_distortion
 
 __all__ = [
     "BRIGHT",

@@ -14,7 +14,7 @@ from tests.benchmarks.scaling import exponent
 from tests.benchmarks.timing import say
 
 if TYPE_CHECKING:
-    from tests.dithered_fields import DitheredField
+    from tests.kinds.selfcal.dithered_fields import DitheredField
 
 __all__ = ["FULL", "QUICK", "WARM", "Sizes", "measure", "run", "simulated"]
 
@@ -46,9 +46,9 @@ def measure(exposures: int, stars: int, order: int) -> dict[str, Any]:
 
 def simulated(exposures: int, stars: int, order: int) -> DitheredField:
     """Field of two chips, with 5 % of false detections."""
+    from bayesdist.kinds.selfcal.patterns.exposures import dither_pattern
     from bayesdist.model import Chip
-    from bayesdist.simulate.dithers import dither_pattern
-    from tests.dithered_fields import simulate_dithers, smooth_distortion
+    from tests.kinds.selfcal.dithered_fields import simulate_dithers, smooth_distortion
 
     rng = np.random.default_rng(1)
     chips = tuple(Chip(n, f"WFC{n}", (4096.0, 2048.0), (2048.0, 1024.0)) for n in (1, 2))
@@ -65,8 +65,8 @@ def simulated(exposures: int, stars: int, order: int) -> DitheredField:
 
 
 def _calibrated(exposures: int, stars: int, order: int) -> dict[str, Any]:
-    from bayesdist.infer.selfcal import sample_selfcal, self_calibrate
-    from bayesdist.infer.selfcal.calibrate import star_catalogue
+    from bayesdist.kinds.selfcal.infer import sample_selfcal, self_calibrate
+    from bayesdist.kinds.selfcal.infer.calibrate import star_catalogue
 
     field = simulated(exposures, stars, order)
     detections = field.unlabelled

@@ -39,9 +39,9 @@ QUICK = Sizes((0, 2), 4, 400, 2, 2**9, 300)
 
 def measure(workers: int, exposures: int, stars: int, order: int, piece: int) -> dict[str, Any]:
     """Group, solve and sample, with so many workers."""
-    from bayesdist.data.matching import field as friends
     from bayesdist.infer import Compute
-    from bayesdist.infer.selfcal import elimination
+    from bayesdist.kinds.selfcal import grouping as friends
+    from bayesdist.kinds.selfcal.infer import elimination
 
     elimination.PIECE = friends.CELL = piece
     compute = Compute(engine="dask", workers=workers) if workers else None
@@ -59,12 +59,12 @@ def measure(workers: int, exposures: int, stars: int, order: int, piece: int) ->
 
 
 def _stages(compute: Any, client: Any, exposures: int, stars: int, order: int) -> dict[str, Any]:
-    from bayesdist.data.matching.field import friends_of_friends
     from bayesdist.infer.equations.priors import Prior
-    from bayesdist.infer.selfcal import sample_selfcal
-    from bayesdist.infer.selfcal.elimination import each_of
-    from bayesdist.infer.selfcal.mode import solve_in_gauge
-    from bayesdist.infer.selfcal.problem import places_of, prepare
+    from bayesdist.kinds.selfcal.grouping import friends_of_friends
+    from bayesdist.kinds.selfcal.infer import sample_selfcal
+    from bayesdist.kinds.selfcal.infer.elimination import each_of
+    from bayesdist.kinds.selfcal.infer.mode import solve_in_gauge
+    from bayesdist.kinds.selfcal.infer.problem import places_of, prepare
 
     field = simulated(exposures, stars, order)
     model, detections, theta = field.model, field.unlabelled, field.theta

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from bayesdist.data.matching.pairs import LinearMap, best_similarity, iterated_map
-from bayesdist.infer.selfcal import SelfCalibrationMode, self_calibrate
-from bayesdist.infer.selfcal.problem import Problem, StarPriors
+from bayesdist.kinds.selfcal.infer import SelfCalibrationMode, self_calibrate
+from bayesdist.kinds.selfcal.infer.problem import Problem, StarPriors
 from bayesdist.model import DistortionModel
 from tests.benchmarks.dithered import (
     BRIGHT,

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tests.app.selfcal.support import list_table, small, write_selfcal
 from tests.app.support import edit, good
+from tests.kinds.selfcal.runs.support import list_table, small, write_selfcal
 
 CONFIG = """
 [data]

@@ -9,6 +9,7 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
+from bayesdist.app.config.section import Section
 from bayesdist.errors import ConfigError
 
 Location = tuple[str | int, ...]
@@ -29,31 +30,7 @@ _KINDS = {
 _BRANCHES = ("float", "str", "int", "constrained-float", "constrained-int", "constrained-str")
 
 
-# new names of old keys, by section
-RENAMED = {
-    "assess.horizon": "years_ahead",
-    "budget.in_residuals": "included_in_scatter",
-    "campaign.aberration": "vafactor_source",
-    "campaign.motions": "pm_selection",
-    "campaign.start": "initial_distortion",
-    "selfcal.least_detections": "min_detections",
-    "selfcal.rounds": "max_iterations",
-    "selfcal.start": "initial_distortion",
-    "tables.rounds": "max_iterations",
-}
-
-# advice for a key that a kind of run does not have
-INSTEAD = {
-    ("selfcal", "model.frames"): "set selfcal.frames",
-    ("selfcal", "outliers.match_radius"): "set selfcal.match_radius",
-    ("selfcal", "products.wise_meta"): "ask for sip or idctab",
-    ("campaign", "model.frames"): "leave it out: a campaign has frames of its own",
-    ("selfcal", "prior_calibration"): "set selfcal.initial_distortion, which is where it begins",
-    ("campaign", "prior_calibration"): "leave it out: the scatter of the exposures is their prior",
-    ("campaign", "prior"): "leave it out: the scatter of the exposures is their prior",
-}
-
-Kind = type[BaseModel]
+Kind = type[Section]
 
 
 def as_config_error(
@@ -94,8 +71,9 @@ def _unknown_key(kinds: Mapping[str, Kind], kind: str, location: Location) -> tu
     """Cause and advice for a key that a kind of configuration does not have."""
     parts = [part for part in location if isinstance(part, str) and not _is_branch(part)]
     name, path = parts[-1], ".".join(parts)
-    if path in RENAMED:
-        return f"unknown key {name!r}: it is called {RENAMED[path]!r} now", "rename it"
+    for model in (kinds[kind], *kinds.values()):
+        if path in model.renamed:
+            return f"unknown key {name!r}: it is called {model.renamed[path]!r} now", "rename it"
     other_kinds = [
         f"[{k}]" for k in kinds if k != kind and name in _known_keys(kinds[k], parts[:-1])
     ]
@@ -103,7 +81,7 @@ def _unknown_key(kinds: Mapping[str, Kind], kind: str, location: Location) -> tu
         cause = (
             f"unknown key {name!r}: it is of {' and '.join(other_kinds)}, and this is a [{kind}]"
         )
-        return cause, INSTEAD.get((kind, path), "leave it out")
+        return cause, kinds[kind].instead.get(path, "leave it out")
     keys = _known_keys(kinds[kind], parts[:-1])
     near = get_close_matches(name, keys, 1, cutoff=0.4)
     do = f"use {near[0]!r} if that is meant" if near else f"known: {', '.join(sorted(keys))}"
@@ -149,7 +127,7 @@ def _known_keys(kind: Kind, sections: Sequence[str]) -> list[str]:
     return list(_fields(current))
 
 
-def _fields(kind: Kind) -> dict[str, FieldInfo]:
+def _fields(kind: type[BaseModel]) -> dict[str, FieldInfo]:
     """Fields of a section, including those of its subclasses for mission formats."""
     return {
         name: field

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Self
@@ -90,6 +90,10 @@ class RunConfig(Section):
     title: ClassVar[str]  # what the run begins with
     begins_with: ClassVar[str] = "match"  # first stage; 'fit' if stars are matched before the run
     is_dated: ClassVar[bool] = False  # True if all exposures have dates
+    renamed: ClassVar[Mapping[str, str]] = {
+        "assess.horizon": "years_ahead",
+        "budget.in_residuals": "included_in_scatter",
+    }
 
     detector: RunDetector = RunDetector()
     chip: list[ChipBlock] = Field(default_factory=list)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from typing import Annotated, Literal, Self, TypeVar
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Annotated, ClassVar, Literal, Self, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, model_validator
 
@@ -21,6 +21,10 @@ class Section(BaseModel):
     """Section of a configuration file; unknown keys are errors."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    # for error messages about unknown keys, by the path of the key in this section
+    renamed: ClassVar[Mapping[str, str]] = {}  # new names of old keys
+    instead: ClassVar[Mapping[str, str]] = {}  # advice for keys of other kinds of runs
 
     def faults(self) -> Iterator[str]:
         """Faults of the section as a whole, as 'cause; advice'; the first one is reported."""

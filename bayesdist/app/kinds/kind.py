@@ -9,17 +9,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, TypeVar
 
 from bayesdist.app.artefacts.stored_fit import read_stored_fit
+from bayesdist.app.kinds.further_exposures import FurtherExposures
 from bayesdist.app.kinds.sampling import sample_stars
 from bayesdist.app.run import Run
 from bayesdist.assess.model import with_diagnosed_errors
 from bayesdist.assess.terms.forms import ErrorTerm
 from bayesdist.data import MagnitudeErrors, Matches, ReferenceCatalog
+from bayesdist.diagnose.diagnostics import FittedStars
 from bayesdist.diagnose.holdout.predictive import Predictive, predictive_of
 from bayesdist.diagnose.overlap import OverlapTest
 from bayesdist.infer import Posterior
 from bayesdist.infer.catalogue.star_errors import StarErrors
 from bayesdist.infer.exposures.hierarchy import Settling
-from bayesdist.infer.selfcal import SelfCalibrationMode
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.model import DistortionModel, LookupTable
 from bayesdist.utils.arrays import Float
@@ -51,7 +52,7 @@ class Questions:
     structure: bool = True  # False if look-up tables were fitted to the structure
     exposures: bool = True  # False if a hierarchy of exposures was fitted
     settling: Settling | None = None  # applied to the shifts of single chips after sampling
-    eliminated: SelfCalibrationMode | None = None  # solution with the positions of stars
+    eliminated: FittedStars | None = None  # diagnostics if the positions of stars were fitted
 
 
 @dataclass(frozen=True)
@@ -193,6 +194,10 @@ class RunKind(ABC, Generic[C, I]):
     def report_parts(self, run: Run) -> dict[str, Any]:
         """Fields of the content of the report that only this kind has, by their names."""
         return {}
+
+    def further_exposures(self, run: Run) -> FurtherExposures:
+        """Exposures that requirements may need in addition to those of a run."""
+        return FurtherExposures(run)
 
     def fit_of_new_exposures(
         self, release: Run, new: Path

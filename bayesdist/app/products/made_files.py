@@ -28,7 +28,6 @@ from bayesdist.assess.terms.parameters import (
 from bayesdist.calibration.calibration import Calibration, GaussianSolution, calibration_of
 from bayesdist.calibration.chip_map import FurtherError
 from bayesdist.calibration.plane import ARCSEC, Plane
-from bayesdist.infer.selfcal.prior import fitted_polynomials, undistorted
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.model import LookupTable
 from bayesdist.products.common.document import BuildOptions, Built
@@ -158,9 +157,10 @@ def rehearse_files(product: ProductInput, config: Config) -> None:
 def rehearse_outline(outline: Outline, config: Config, base: Path, source: str) -> None:
     """Make all products from a solution of undistorted chips, before stars are matched."""
     model, time = outline.model, outline.model.time
-    chips = fitted_polynomials(undistorted(model.chips, outline.pixel), model.chips, model.order)
-    mean = np.zeros(model.n_params)
-    for chip, coefficients in zip(model.chips, chips, strict=True):
+    monomials, mean = np.zeros((2, model.n_terms)), np.zeros(model.n_params)
+    monomials[0, 1] = monomials[1, 2] = outline.pixel
+    for chip in model.chips:
+        coefficients = model.basis(chip.number).from_monomials(monomials)
         for axis in (0, 1):
             mean[model.coefficient_slice(chip.number, axis)] = coefficients[axis]
     small = (REHEARSED_SIGMA * outline.pixel) ** 2

@@ -29,19 +29,7 @@ with kept_by_content():
         precisions,
         shear,
     )
-    from bayesdist.infer.kernel.star_draws import (
-        DOUBTFUL,
-        FALSE,
-        MEMBER,
-        MOST_DOUBTFUL,
-        log_marginals,
-    )
     from bayesdist.infer.kernel.stars import linearised, memberships, positions, residuals, slopes
-    from bayesdist.infer.kernel.stars_unknown import (
-        EliminationSums,
-        eliminate_stars,
-        weighted_stars,
-    )
     from bayesdist.infer.kernel.truncated import (
         truncated_log_likelihood,
         truncated_memberships,
@@ -51,26 +39,19 @@ with kept_by_content():
 
 __all__ = [
     "BLOCK",
-    "DOUBTFUL",
-    "FALSE",
     "GAUSSIAN",
-    "MEMBER",
-    "MOST_DOUBTFUL",
     "NO_OUTLIERS",
     "PIECE",
     "UNIFORM",
     "Constants",
-    "EliminationSums",
     "Moments",
     "densities",
     "draw_deviations",
-    "eliminate_stars",
     "gaussians",
     "get_threads",
     "least_squares_moments",
     "linearised",
     "log_likelihood",
-    "log_marginals",
     "memberships",
     "mixture_moments",
     "pieces_of",
@@ -84,5 +65,4 @@ __all__ = [
     "truncated_memberships",
     "truncated_moments",
     "truncated_scores",
-    "weighted_stars",
 ]

@@ -24,29 +24,36 @@ _private: list[tempfile.TemporaryDirectory[str]] = []  # removed when the proces
 
 
 @contextmanager
-def kept_by_content() -> Iterator[None]:
+def kept_by_content(further: Path | None = None) -> Iterator[None]:
     """Context in which numba functions must be declared to use the cache folder of these sources.
 
     The folder is next to the sources, or in the user's cache if these are read-only.  If neither is
     writable, a temporary folder of this process is used, and everything is compiled again.
     NUMBA_CACHE_DIR takes precedence.
+
+    Parameters
+    ----------
+    further : Path, optional
+        Folder of compiled functions outside this package, which call functions of it.  They have a
+        cache folder next to their own sources, named after those of both.
     """
     before = config.CACHE_DIR
-    config.CACHE_DIR = before or str(_folder())
+    config.CACHE_DIR = before or str(_folder(further))
     try:
         yield
     finally:
         config.CACHE_DIR = before
 
 
-def _folder() -> Path:
+def _folder(further: Path | None) -> Path:
     """First cache folder that is writable."""
-    package = Path(__file__).parent
+    packages = [Path(__file__).parent, *([] if further is None else [further])]
     digest = hashlib.sha256()
-    for source in sorted(package.glob("*.py")):
-        digest.update(read_bytes(source))
+    for package in packages:
+        for source in sorted(package.glob("*.py")):
+            digest.update(read_bytes(source))
     name = digest.hexdigest()[:16]
-    for folder in (package / "__pycache__", *_user_cache()):
+    for folder in (packages[-1] / "__pycache__", *_user_cache()):
         if _is_writable(folder / name):
             return folder / name
     log.warning(

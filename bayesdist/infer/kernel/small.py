@@ -14,13 +14,30 @@ import numpy as np
 from bayesdist.infer.kernel.blocks import PASS
 from bayesdist.infer.kernel.lanes import FAST
 from bayesdist.infer.kernel.numeric import exp_negative, whole_vectors
-from bayesdist.infer.kernel.star_modes import cholesky
 from bayesdist.utils.arrays import Float
 
 # options of functions with vectorised sums.  Their loops either add or write arrays: before a loop
 # that does both, compiled code compares the places of the arrays in memory, and adds in another
 # order where these are near each other
 SUMS = PASS | {"fastmath": FAST | {"reassoc"}}
+
+
+@nb.njit(cache=True, forceinline=True)
+def cholesky(A, q):
+    """Replace A (q, q) by its lower Cholesky factor; return False if it is not positive."""
+    whole_vectors()
+    for i in range(q):
+        for j in range(i + 1):
+            total = A[i, j]
+            for k in range(j):
+                total -= A[i, k] * A[j, k]
+            if i == j:
+                if not total > 0.0:
+                    return False
+                A[i, i] = math.sqrt(total)
+            else:
+                A[i, j] = total / A[j, j]
+    return True
 
 
 @nb.njit(cache=True)

@@ -1,4 +1,4 @@
-"""Transformations of a solution: reference gauge, one exposure, one time segment, linear terms.
+"""Transformations of a solution: gauges, one exposure, one time segment, linear terms.
 
 The draws of a transformed solution are the transformed draws of its source.  Its covariance is
 propagated with the exact Jacobian of the transformation at the mean.
@@ -382,6 +382,49 @@ def _linear(solution: Solution, labels: tuple[str, ...], jacobian: Float) -> Lin
     n = jacobian.shape[1]
     cov = jacobian @ np.asarray(solution.cov, float)[:n, :n] @ jacobian.T
     return LinearTerms(labels, jacobian @ np.asarray(solution.mean, float)[:n], (cov + cov.T) / 2)
+
+
+def gauge_free_matrix(model: DistortionModel, theta: Float, null: Float) -> Float:
+    """Matrix S (D, D) that removes the part along free directions from a change of the parameters.
+
+    Solutions of the same detections in different gauges differ by a move along directions that the
+    detections do not determine.  Without such moves, errors are the same in all gauges; this is an
+    S-transformation (Baarda 1973; Teunissen 1985).
+
+    `null` (D, d) are the free directions, such as `Gauge.null`; S null = 0.  For a change d of the
+    parameters, S d is d minus the combination of free directions that best fits the change of the
+    positions, by least squares over the area of all chips in the first exposure.
+    """
+    D = model.n_params
+    if not null.shape[1]:
+        return np.eye(D)
+    rows = []
+    for chip in model.chips:
+        x, y, area = chip.quadrature(model.order + 1)  # exact for squares of the polynomials
+        identity = {"exposure": np.zeros(len(x), np.int64), "chip": np.full(len(x), chip.number)}
+        if model.time is not None:
+            identity["epoch"] = np.full(len(x), model.time.epoch0[0])
+        J = model.jacobian(theta, x, y, **identity)
+        rows.append((np.sqrt(area)[:, None, None] * J).reshape(-1, D))
+    J = np.concatenate(rows)
+    return np.asarray(np.eye(D) - null @ np.linalg.pinv(J @ null) @ J)
+
+
+def gauge_free(solution: Solution, null: Float) -> Solution:
+    """Solution with errors of relative positions only, and the same mean.
+
+    Parameters
+    ----------
+    solution : Solution
+    null : ndarray, shape (D, d)
+        Directions that the detections do not determine, such as `Gauge.null`.
+
+    Returns
+    -------
+    Solution
+        Its errors do not include moves along these directions.
+    """
+    return solution.mapped(gauge_free_matrix(solution.model, solution.mean, null))
 
 
 def _linear_jacobian(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import ClassVar, Literal
 
@@ -81,6 +81,18 @@ class CampaignConfig(RunConfig):
     periods: ClassVar[None] = None
     prior: ClassVar[tuple[PriorBlock, ...]] = ()
     prior_calibration: ClassVar[None] = None
+    renamed: ClassVar[Mapping[str, str]] = {
+        **RunConfig.renamed,
+        "campaign.aberration": "vafactor_source",
+        "campaign.motions": "pm_selection",
+        "campaign.start": "initial_distortion",
+        "tables.rounds": "max_iterations",
+    }
+    instead: ClassVar[Mapping[str, str]] = {
+        "model.frames": "leave it out: a campaign has frames of its own",
+        "prior": "leave it out: the scatter of the exposures is their prior",
+        "prior_calibration": "leave it out: the scatter of the exposures is their prior",
+    }
 
     campaign: CampaignBlock
     tables: TablesBlock = TablesBlock()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
@@ -131,6 +131,18 @@ class SelfcalConfig(RunConfig):
     periods: ClassVar[None] = None
     holdout: ClassVar[None] = None
     prior_calibration: ClassVar[None] = None
+    renamed: ClassVar[Mapping[str, str]] = {
+        **RunConfig.renamed,
+        "selfcal.least_detections": "min_detections",
+        "selfcal.rounds": "max_iterations",
+        "selfcal.start": "initial_distortion",
+    }
+    instead: ClassVar[Mapping[str, str]] = {
+        "model.frames": "set selfcal.frames",
+        "outliers.match_radius": "set selfcal.match_radius",
+        "prior_calibration": "set selfcal.initial_distortion, which is where it begins",
+        "products.wise_meta": "ask for sip or idctab",
+    }
 
     selfcal: SelfcalBlock
     gauge: GaugeBlock = GaugeBlock()

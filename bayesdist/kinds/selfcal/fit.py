@@ -14,11 +14,11 @@ from bayesdist.app.artefacts.stored_fit import FIT_AGAIN, read_stored_fit
 from bayesdist.app.run import Run
 from bayesdist.files.hdf5 import read_arrays
 from bayesdist.infer import Compute, GaussianPriors, Posterior
-from bayesdist.infer.selfcal import SelfCalibrationMode, sample_selfcal
-from bayesdist.infer.selfcal.elimination import Mixture, one_cluster
-from bayesdist.infer.selfcal.gauge import Decision
-from bayesdist.infer.selfcal.mode import gauge_of, mode_at, solve_in_gauge
 from bayesdist.kinds.selfcal.gauge import fixed_by, gauge_summary, gauge_table, gauge_words
+from bayesdist.kinds.selfcal.infer import SelfCalibrationMode, sample_selfcal
+from bayesdist.kinds.selfcal.infer.elimination import Mixture, one_cluster
+from bayesdist.kinds.selfcal.infer.gauge import Decision
+from bayesdist.kinds.selfcal.infer.mode import gauge_of, mode_at, solve_in_gauge
 from bayesdist.kinds.selfcal.inputs import Inputs
 from bayesdist.kinds.selfcal.matched import (
     FirstSolution,

@@ -8,8 +8,8 @@ import numpy as np
 from astropy.table import Table
 
 from bayesdist.infer.equations.priors import Prior
-from bayesdist.infer.selfcal.gauge import FAR, Gauge, NamedDirection, find_gauge
-from bayesdist.infer.selfcal.mode import SelfCalibrationMode
+from bayesdist.kinds.selfcal.infer.gauge import FAR, Gauge, NamedDirection, find_gauge
+from bayesdist.kinds.selfcal.infer.mode import SelfCalibrationMode
 from bayesdist.kinds.selfcal.known import GaugeConstraints
 from bayesdist.model import DistortionModel
 

@@ -14,12 +14,12 @@ from bayesdist.app.kinds.kind import Outline
 from bayesdist.calibration.plane import ARCSEC
 from bayesdist.data import ReferenceCatalog, read_catalog, read_exposures
 from bayesdist.data.detections import Detections, detections_of
-from bayesdist.data.matching.field import refuse_duplicates
 from bayesdist.data.sky import parallax_factors
 from bayesdist.errors import InputError
-from bayesdist.infer.selfcal import ReferenceStars
-from bayesdist.infer.selfcal.problem import Problem, TangentPlane, contacts_of, prepare
 from bayesdist.kinds.selfcal.config import SelfcalConfig
+from bayesdist.kinds.selfcal.grouping import refuse_duplicates
+from bayesdist.kinds.selfcal.infer import ReferenceStars
+from bayesdist.kinds.selfcal.infer.problem import Problem, TangentPlane, contacts_of, prepare
 from bayesdist.kinds.selfcal.known import Commanded, GaugeConstraints, read_commanded
 from bayesdist.kinds.selfcal.start import started
 from bayesdist.kinds.star_lists import lists_of, refuse_other_chips

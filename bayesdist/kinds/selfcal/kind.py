@@ -14,6 +14,7 @@ from bayesdist.app.store.output import provenance_notes
 from bayesdist.infer import Posterior
 from bayesdist.kinds.selfcal.config import SelfcalConfig
 from bayesdist.kinds.selfcal.fit import fit_selfcal, load_selfcal, sample_detections
+from bayesdist.kinds.selfcal.further_exposures import DitheredExposures
 from bayesdist.kinds.selfcal.inputs import (
     Inputs,
     outline_of_selfcal,
@@ -100,7 +101,7 @@ class SelfcalKind(RunKind[SelfcalConfig, Inputs]):
         """Residuals are smaller by the degrees of freedom of the stars."""
         return Questions(
             centroid=run.errors.by_magnitude,
-            eliminated=run.part(SelfCalibrated).mode,
+            eliminated=run.part(SelfCalibrated),
         )
 
     def save_diagnosed(self, run: Run) -> None:
@@ -120,6 +121,10 @@ class SelfcalKind(RunKind[SelfcalConfig, Inputs]):
     def null_space(self, run: Run) -> Float | None:
         """Directions that only the gauge fixes."""
         return run.part(SelfCalibrated).gauge.null
+
+    def further_exposures(self, run: Run) -> DitheredExposures:
+        """Exposures dithered like the existing ones, over the same stars."""
+        return DitheredExposures(run, run.part(SelfCalibrated).mode)
 
     def checks(self, run: Run) -> tuple[Check, ...]:
         """Checks of degeneracies, constraints and detections."""

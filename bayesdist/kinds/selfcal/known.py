@@ -13,9 +13,9 @@ from bayesdist.data.tables.names import find_columns
 from bayesdist.errors import InputError
 from bayesdist.files.tables import read_table
 from bayesdist.infer.equations.priors import GaussianPriors, Prior
-from bayesdist.infer.selfcal.prior import frame_prior, pointing_prior, tie
-from bayesdist.infer.selfcal.sky_moves import functionals
 from bayesdist.kinds.selfcal.config import SelfcalConfig
+from bayesdist.kinds.selfcal.infer.prior import frame_prior, pointing_prior, tie
+from bayesdist.kinds.selfcal.infer.sky_moves import functionals
 from bayesdist.model import DistortionModel
 from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.distributions import chi2_sf

@@ -24,10 +24,10 @@ from bayesdist.data.matches import Matches
 from bayesdist.files.documents import json_of
 from bayesdist.files.faults import restoring
 from bayesdist.files.hdf5 import read_arrays, write_arrays
-from bayesdist.infer.selfcal import SelfCalibrationMode
-from bayesdist.infer.selfcal.calibrate import scatter_by_magnitude
-from bayesdist.infer.selfcal.elimination import Mixture, memberships
-from bayesdist.infer.selfcal.problem import Problem
+from bayesdist.kinds.selfcal.infer import SelfCalibrationMode
+from bayesdist.kinds.selfcal.infer.calibrate import scatter_by_magnitude
+from bayesdist.kinds.selfcal.infer.elimination import Mixture, memberships
+from bayesdist.kinds.selfcal.infer.problem import Problem
 from bayesdist.kinds.selfcal.inputs import Inputs
 from bayesdist.model import DistortionModel
 from bayesdist.utils.arrays import Float

@@ -14,13 +14,13 @@ from bayesdist.app.screen import number
 from bayesdist.data.detections import NO_STAR
 from bayesdist.data.matching.pairs import hull_of, inside_hull
 from bayesdist.errors import DegenerateError, InputError, NotSettledError
-from bayesdist.infer.selfcal import SelfCalibration
-from bayesdist.infer.selfcal.calibrate import self_calibrate
-from bayesdist.infer.selfcal.elimination import memberships, one_cluster
-from bayesdist.infer.selfcal.gauge import NamedDirection
-from bayesdist.infer.selfcal.problem import places_of
 from bayesdist.infer.solution.geometry import geometries
 from bayesdist.kinds.selfcal.gauge import CONVENTION, fixed_by
+from bayesdist.kinds.selfcal.infer import SelfCalibration
+from bayesdist.kinds.selfcal.infer.calibrate import self_calibrate
+from bayesdist.kinds.selfcal.infer.elimination import memberships, one_cluster
+from bayesdist.kinds.selfcal.infer.gauge import NamedDirection
+from bayesdist.kinds.selfcal.infer.problem import places_of
 from bayesdist.kinds.selfcal.inputs import Inputs
 from bayesdist.kinds.selfcal.matched import with_detections
 from bayesdist.model import DistortionModel

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from astropy.table import Table
 from numpy.typing import NDArray
 
@@ -14,9 +15,16 @@ from bayesdist.app.artefacts.parts import Part
 from bayesdist.app.store.output import write_table
 from bayesdist.data import ReferenceCatalog
 from bayesdist.data.matches import Matches
+from bayesdist.diagnose.correlated import Discrepancy, DiscrepancyPriors
+from bayesdist.diagnose.residuals.misfit import Misfit
+from bayesdist.diagnose.score.result import ScoreTest
 from bayesdist.files.hdf5 import write_arrays
-from bayesdist.infer.selfcal import Gauge, SelfCalibrationMode
+from bayesdist.kinds.selfcal.diagnose.correlated import selfcal_discrepancy
+from bayesdist.kinds.selfcal.diagnose.eliminated import taken_by_stars
+from bayesdist.kinds.selfcal.diagnose.tests import dithered_misfit, selfcal_score_tests
+from bayesdist.kinds.selfcal.infer import Gauge, SelfCalibrationMode
 from bayesdist.model import DistortionModel
+from bayesdist.utils.arrays import Float, Int
 
 SOLUTION, GAUGE = "solution.h5", "gauge.ecsv"
 
@@ -40,6 +48,29 @@ class SelfCalibrated(Part):
     references: ReferenceCatalog | None = None  # reference stars that are also in a catalogue
     # point (u, v) where the tangent plane of the stars touches the sky; None if the sky is flat
     contact: tuple[float, float] | None = None
+
+    # -- bayesdist.diagnose.diagnostics.FittedStars -----------------------------------------------
+
+    def misfits(self) -> tuple[Misfit, ...]:
+        """Structure in the residuals of all chips."""
+        return (dithered_misfit(self.mode),)
+
+    def absorbed(self, rows: Int) -> Float:
+        """Fraction (N,) of the variance of the detections that fitted positions of stars absorb."""
+        solved_rows = self.mode.problem.rows
+        fraction = np.zeros(max(int(solved_rows.max(initial=-1)), int(rows.max(initial=-1))) + 1)
+        fraction[solved_rows] = taken_by_stars(self.mode)
+        return fraction[rows]
+
+    def discrepancy(self, *, rng: np.random.Generator, priors: DiscrepancyPriors) -> Discrepancy:
+        """Correlated errors beyond the model."""
+        return selfcal_discrepancy(self.mode, rng=rng, priors=priors)
+
+    def score_tests(self, stars: Matches) -> tuple[ScoreTest, ...]:
+        """Score tests of the residuals, with the stars eliminated."""
+        return selfcal_score_tests(self.mode, mag=stars.mag, colour=stars.colour, epoch=stars.epoch)
+
+    # -- bayesdist.app.artefacts.parts.Part -------------------------------------------------------
 
     def save(self, folder: Path) -> None:
         """Write the solution and the gauge to the folder of a run."""

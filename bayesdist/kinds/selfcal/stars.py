@@ -16,7 +16,7 @@ from bayesdist.data import ReferenceCatalog
 from bayesdist.data.storage import write_columns
 from bayesdist.diagnose.correlated import Discrepancy
 from bayesdist.infer import Compute
-from bayesdist.infer.selfcal import SelfCalibrationMode, StarCatalogue, star_catalogue
+from bayesdist.kinds.selfcal.infer import SelfCalibrationMode, StarCatalogue, star_catalogue
 from bayesdist.kinds.selfcal.solved import SelfCalibrated
 from bayesdist.utils.arrays import Float
 

@@ -9,21 +9,20 @@ import numpy as np
 from bayesdist.app.config.section import one_chip
 from bayesdist.data import ReferenceCatalog
 from bayesdist.data.detections import Detections
-from bayesdist.data.matching.field import mutual_frames
 from bayesdist.data.matching.pairs import LinearMap, best_similarity
 from bayesdist.data.matching.similarity import Similarity, find_similarity, pattern_index
 from bayesdist.errors import InputError
 from bayesdist.infer import load_fit, load_posterior
-from bayesdist.infer.selfcal.prior import (
-    Start,
+from bayesdist.kinds.selfcal.config import SelfcalConfig
+from bayesdist.kinds.selfcal.grouping import mutual_frames
+from bayesdist.kinds.selfcal.infer.prior import (
     chips_side_by_side,
     fitted_polynomials,
     start_parameters,
     undistorted,
 )
-from bayesdist.kinds.selfcal.config import SelfcalConfig
 from bayesdist.kinds.selfcal.known import Commanded
-from bayesdist.kinds.star_lists import known_calibration, positions_by_chip, start_of
+from bayesdist.kinds.star_lists import Start, known_calibration, positions_by_chip, start_of
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.products.registry import open_document
 from bayesdist.utils.arrays import Float, Int

@@ -14,7 +14,6 @@ from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.tables.margins import judged_requirements
 from bayesdist.assess.evaluation import with_measured_centroids
 from bayesdist.assess.model import with_diagnosed_errors, with_shared_stars
-from bayesdist.assess.planning.dithers import further_dithers
 from bayesdist.assess.planning.futures import (
     ExistingData,
     Futures,
@@ -27,14 +26,10 @@ from bayesdist.errors import InputError
 from bayesdist.infer.compare.planning import (
     ExposureContent,
     exposure_content,
-    exposure_information,
     with_information,
 )
-from bayesdist.infer.selfcal import SelfCalibrationMode
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.utils.arrays import Float
-
-LATER = 4  # number of dates that represent evenly spread exposures
 
 
 def plan(run: str | Path, *, name: str | None = None, epochs: Sequence[float] = ()) -> str:
@@ -56,7 +51,7 @@ def plan(run: str | Path, *, name: str | None = None, epochs: Sequence[float] = 
         )
     with Run.of(RunDirectory.open(run)) as opened:
         opened.directory.require("plan", ("fit", "sample", "diagnose", "evaluate"))
-        exposures = _exposures_of(opened)
+        exposures = opened.kind.further_exposures(opened)
         if epochs and exposures.dateless:
             raise InputError(exposures.dateless, where=str(run), do="leave --epochs out")
         content = content_of(opened)
@@ -136,7 +131,7 @@ def content_of(run: Run) -> ExposureContent:
         stars.table,
         true[:, None] / (sigma**2 + jitter**2),
         n_total=stars.n_total,
-        n_exposures=_exposures_of(run).count,
+        n_exposures=run.kind.further_exposures(run).count,
     )
 
 
@@ -147,7 +142,7 @@ def schedules_of(
     epochs: Sequence[float] = (),
 ) -> list[Schedule]:
     """Schedules of exposures: at relevant dates, or one schedule if dates do not matter."""
-    return _exposures_of(run).schedules(requirement, content, epochs)
+    return run.kind.further_exposures(run).schedules(requirement, content, epochs)
 
 
 def futures_of(run: Run, content: ExposureContent) -> Callable[[Requirement], Futures]:
@@ -167,7 +162,7 @@ def futures_of(run: Run, content: ExposureContent) -> Callable[[Requirement], Fu
             return extended
         return with_shared_stars(extended, hierarchy, diagnostics.catalogue)
 
-    exposures = _exposures_of(run)
+    exposures = run.kind.further_exposures(run)
     weight = np.mean([np.sum([m[axis, 0, 0] for m in content.moments.values()]) for axis in (0, 1)])
     seed = int(assessment_rng(run.config).integers(2**63))
 
@@ -185,87 +180,3 @@ def futures_of(run: Run, content: ExposureContent) -> Callable[[Requirement], Fu
         )
 
     return of
-
-
-class _Exposures:
-    """Exposures of a run with a catalogue; further ones have stars like theirs."""
-
-    gain = 1.0
-
-    def __init__(self, run: Run) -> None:
-        self.run = run
-
-    @property
-    def count(self) -> int:
-        """Number of exposures of the run."""
-        return max(len(self.run.placed.exposure_names), 1)
-
-    @property
-    def dateless(self) -> str:
-        """Clause on why dates of further exposures do not matter; empty if they do."""
-        if self.run.solution.model.time is not None:
-            return ""
-        return "does not depend on time, so that the dates of further exposures do not matter"
-
-    def sentence(self, content: ExposureContent) -> str:
-        """Sentence on the exposures that are assumed."""
-        return f"An exposure is taken to hold {content.n_stars:.0f} matched stars as these do."
-
-    def schedules(
-        self, requirement: Requirement, content: ExposureContent, epochs: Sequence[float]
-    ) -> list[Schedule]:
-        """Schedules at relevant dates, or one schedule if dates do not matter."""
-        solution, epoch = self.run.solution, self.run.epoch
-
-        def worth(date: float | None) -> Float:
-            return exposure_information(solution, content, date)
-
-        if solution.model.time is None or epoch is None:
-            return [Schedule("at any date", worth(None))]
-        wanted = requirement.epoch or (requirement.epochs or [epoch])[-1]
-        last = float(np.max(self.run.diagnostics.sample.table.column("epoch")))
-        schedules = [
-            Schedule(f"at {date:.2f}", worth(date), single_date=True)
-            for date in dict.fromkeys([*epochs, wanted])
-        ]
-        if wanted > last:
-            spread = [worth(float(date)) for date in np.linspace(last, wanted, LATER + 1)[1:]]
-            name = f"evenly from {last:.2f} to {wanted:.2f}"
-            schedules.append(Schedule(name, np.sum(spread, axis=0) / len(spread)))
-        return schedules
-
-
-class _DitheredExposures(_Exposures):
-    """Exposures of a self-calibration; each is informative about stars in other exposures only."""
-
-    dateless = (
-        "is a run of a self-calibration, whose exposures count as those at hand with their dates"
-    )
-
-    def __init__(self, run: Run, mode: SelfCalibrationMode) -> None:
-        super().__init__(run)
-        self.mode, self.gain = mode, mode.gain
-
-    @property
-    def count(self) -> int:
-        """Number of exposures of the run."""
-        return len(self.mode.problem.model.exposures)
-
-    def sentence(self, content: ExposureContent) -> str:
-        """Sentence on the exposures that are assumed."""
-        return f"Exposures are taken to be dithered as these {self.count} are, over the same stars."
-
-    def schedules(
-        self, requirement: Requirement, content: ExposureContent, epochs: Sequence[float]
-    ) -> list[Schedule]:
-        """One schedule, of the same dithers."""
-        information = self.gain * self.mode.distortion_information / self.count
-        further = further_dithers(self.mode, self.run.config.sampler.seed)
-        return [Schedule("dithered like these", information, together=further)]
-
-
-def _exposures_of(run: Run) -> _Exposures:
-    """Exposures of a run, with what further ones like them are worth."""
-    mode = run.kind.questions(run).eliminated
-    # exposures without a catalogue are informative only together, which is another computation
-    return _Exposures(run) if mode is None else _DitheredExposures(run, mode)

@@ -12,14 +12,14 @@ from astropy.table import Table
 from bayesdist.app.screen import table_text
 from bayesdist.app.store.keys import attributes
 from bayesdist.app.store.output import record_folder, write_table
-from bayesdist.assess.planning.dithers import (
+from bayesdist.kinds.selfcal.patterns.config import PlanConfig, load_plan
+from bayesdist.kinds.selfcal.patterns.dithers import (
     KINDS,
     PlannedPattern,
     compare_patterns,
     lacking,
     nearly_free,
 )
-from bayesdist.kinds.selfcal.patterns.config import PlanConfig, load_plan
 
 LEGEND = (
     "reach: largest distance of two pointings, pix; free: directions that detections leave free; "
@@ -99,8 +99,8 @@ def _text(found: Sequence[PlannedPattern], config: PlanConfig) -> str:
 
 
 def _write(output: Path, found: Sequence[PlannedPattern], config: PlanConfig, command: str) -> None:
+    from bayesdist.kinds.selfcal.patterns.figure import pattern_maps
     from bayesdist.report.drawing import save_figures  # plotting takes seconds to import
-    from bayesdist.report.figures.commands import pattern_maps
 
     with record_folder(output, "plan.json", command) as (folder, record):
         write_table(_table(found), folder / "patterns.ecsv")

@@ -21,16 +21,16 @@ from bayesdist.app.config.section import (
     reference_first,
     same_names,
 )
-from bayesdist.assess.planning.dithers import Camera, PlannedStars, PriorInformation
 from bayesdist.kinds.selfcal.config import Frames, MinDetections, scale_faults
-from bayesdist.model import Chip
-from bayesdist.simulate.dithers import (
+from bayesdist.kinds.selfcal.patterns.dithers import Camera, PlannedStars, PriorInformation
+from bayesdist.kinds.selfcal.patterns.exposures import (
     DitherPattern,
     dither_pattern,
     flat_coefficients,
     grid_offsets,
     rolls_in_turn,
 )
+from bayesdist.model import Chip
 from bayesdist.utils.arrays import Float
 
 Pair = tuple[PositiveFloat, PositiveFloat]
