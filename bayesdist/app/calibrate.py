@@ -27,7 +27,7 @@ from bayesdist.app.screen import progress_bar
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess import Requirement, UserTerm
 from bayesdist.assess.requirements.requirement import as_requirements
-from bayesdist.assess.terms.given import Catalogue, require_catalogue
+from bayesdist.assess.terms.catalogue import Catalogue, require_catalogue
 from bayesdist.data import Matches, ReadOptions
 from bayesdist.data.reading.options import check_sigma
 from bayesdist.data.reading.table import match_arguments
@@ -112,8 +112,8 @@ def calibrate(
         Distribution of false matches.  If it has no match radius, that of `matches` is used: those
         that `match` made state it, also in the files that they were written to.
     catalogue : Catalogue, optional
-        Systematic position error of the reference catalogue.  Without it verdicts are undecided,
-        because no residual shows this error.
+        Systematic error of the reference catalogue, as in ``bd.Catalogue("Gaia DR3")``.  Without it
+        verdicts are undecided, because no residual shows this error.
     terms : sequence of UserTerm
         Other errors that the data cannot show.
     requirements : Requirement or sequence of Requirement
@@ -158,6 +158,7 @@ def calibrate(
     >>> run.check(bd.Requirement("whole field", "p95", 0.1))[0].verdict
     'met'
     """
+    require_catalogue(catalogue)
     settings = _checked({} if settings is None else settings)
     stars, data = None, {"matches": MATCHES_FILE, "sigma": sigma}
     if _is_path(matches):
@@ -196,6 +197,7 @@ def calibrate(
         "holdout": None
         if isinstance(held_out, int | float) and held_out == 0
         else {"fraction": held_out},
+        "catalogue": None if catalogue is None or catalogue.sigma else catalogue.section(),
         "budget": _budget(catalogue, terms, None if stars is None else stars.unit),
         "requirement": [_requirement_block(limit) for limit in as_requirements(requirements)],
     }
@@ -356,8 +358,7 @@ def _budget(
     catalogue: Catalogue | None, terms: Sequence[UserTerm], unit: str | None
 ) -> list[Settings]:
     """[[budget]] rows of the errors that the user states; `unit` is that of u, v if known."""
-    require_catalogue(catalogue)
-    rows = [] if catalogue is None else [catalogue.budget_row()]
+    rows = [] if catalogue is None or not catalogue.sigma else [catalogue.budget_row()]
     if isinstance(terms, UserTerm):
         terms = [terms]
     if not isinstance(terms, Sequence):

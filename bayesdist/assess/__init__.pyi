@@ -35,9 +35,9 @@ from .requirements.margins import (
 from .solution import chip_places as chip_places
 from .terms.given import (
     TERM_KINDS as TERM_KINDS,
-    Catalogue as Catalogue,
     UserTerm as UserTerm,
 )
+from .terms.catalogue import Catalogue as Catalogue
 from .terms.correlated import LocalErrors as LocalErrors
 from .units import (
     UNITS as UNITS,

@@ -24,13 +24,17 @@ from bayesdist.assess.requirements.margins import Margin, judge
 from bayesdist.assess.requirements.requirement import Requirement, as_requirements
 from bayesdist.assess.requirements.verdict import UNEXAMINED, assumption_checks, catalogue_checks
 from bayesdist.assess.solution import place_of
+from bayesdist.assess.terms.catalogue import (
+    Catalogue,
+    CatalogueSystematics,
+    fraction_of_bright,
+    require_catalogue,
+)
 from bayesdist.assess.terms.forms import ErrorTerm
 from bayesdist.assess.terms.given import (
-    Catalogue,
     UserTerm,
     names_catalogue,
     names_motions,
-    require_catalogue,
     stated_names,
 )
 from bayesdist.assess.units import convert, pixel_scale_of
@@ -129,7 +133,7 @@ def error_budget(
     >>> "the residuals were not examined" in budget.notes[0]
     True
     """
-    stated = _stated_terms(catalogue, terms)
+    stated = _stated_terms(catalogue, terms, diagnostics, epoch)
     settings = _settings(solution, diagnostics, stated, exposure, grid, epoch, n_draws, pixel_scale)
     errors = _error_model(solution, diagnostics, stated, settings, aligned=aligned, chip=chip)
     chips = None
@@ -249,7 +253,7 @@ def check_requirements(
     'met'
     """
     requirements = as_requirements(requirements)
-    stated = _stated_terms(catalogue, terms)
+    stated = _stated_terms(catalogue, terms, diagnostics, epoch)
     settings = _settings(solution, diagnostics, stated, exposure, grid, epoch, n_draws, pixel_scale)
     scale = pixel_scale_of(solution, chip, settings.scale_mas)
     requirements = [r.in_unit_of(solution.model.unit) for r in requirements]
@@ -291,12 +295,22 @@ def check_requirements(
     )
 
 
-def _stated_terms(catalogue: Catalogue | None, terms: Sequence[ErrorTerm]) -> tuple[ErrorTerm, ...]:
+def _stated_terms(
+    catalogue: Catalogue | None,
+    terms: Sequence[ErrorTerm],
+    diagnostics: Diagnostics | None,
+    epoch: Epoch | None,
+) -> tuple[ErrorTerm, ...]:
     """The user's terms in the order of a run: the catalogue first, then the other terms."""
     require_catalogue(catalogue)
     if catalogue is None:
         return tuple(terms)
-    return (catalogue.term(), *terms)
+    dates, bright = np.zeros(0), 1.0
+    if isinstance(diagnostics, Diagnostics):
+        dates, bright = diagnostics.dates, fraction_of_bright(diagnostics.sample.table)
+    if not dates.size and epoch is not None:
+        dates = np.array([year_of(epoch)])
+    return (catalogue.term(dates, bright), *terms)
 
 
 def _settings(
@@ -352,7 +366,7 @@ def _error_model(
         _posterior_of(solution, diagnostics),
         diagnostics,
         # the order of a run, so that sums are identical to the last bit
-        sorted(stated, key=lambda term: isinstance(term, UserTerm)),
+        sorted(stated, key=lambda term: isinstance(term, UserTerm | CatalogueSystematics)),
         hierarchy=None,
         catalogue="catalogue",
         single=settings.single,

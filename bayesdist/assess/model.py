@@ -15,6 +15,7 @@ from scipy.linalg import solve_triangular
 from bayesdist.assess.budget import ErrorBudget, budget_of
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.drawn import DrawnErrors, generators
+from bayesdist.assess.terms.catalogue import CatalogueSystematics
 from bayesdist.assess.terms.correlated import (
     Deviations,
     FieldsOfExposures,
@@ -224,6 +225,8 @@ def error_model(
             errors = replace(term, solution=solution)
         elif isinstance(term, UserTerm):
             other_terms.append(term.in_unit(solution.model.unit, pixel_scale))
+        elif isinstance(term, CatalogueSystematics):
+            other_terms += term.in_field(solution, pixel_scale)
         else:
             other_terms.append(term)
     if not any(isinstance(term, Centroids) for term in other_terms):

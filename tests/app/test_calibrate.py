@@ -289,3 +289,24 @@ def _begun(folder: Path, config: Path) -> Path:
     text = config.read_text().replace("stars.ecsv", str(config.parent / "stars.ecsv"))
     (folder / "config.toml").write_text(text)
     return folder
+
+
+def test_published_errors_of_gaia_decide_a_requirement():
+    """By [catalogue], without a [[budget]] row, and the same in Python; dates are needed."""
+    stars, _ = simulated(400)
+    gaia, need = bd.Catalogue("Gaia DR3"), bd.Requirement("field", "p95", 0.1)
+    options = {"order": 2, "size": SIZE, "reference_pixel": CENTRE, "scale_mas": 100.0}
+    with pytest.raises(bd.InputError, match="date of the exposures is not known"):
+        bd.calibrate(stars, **options, catalogue=gaia)
+    dated = replace(stars, epoch=np.full(len(stars), 2026.0))
+    run = bd.calibrate(dated, **options, catalogue=gaia, requirements=need)
+    assert run.margins[0].verdict == "met"
+    assert "errors given by the user: Gaia DR3, Gaia DR3 proper motions" in run.margins[0].rests_on
+    rows = {row["name"]: row for row in run.budget().rows()}
+    motions = np.hypot(
+        *(rows[f"Gaia DR3 proper motions{part}"]["u"] for part in ("", " (over the field)"))
+    )
+    spin = 0.08**2 / 3  # the stars have no magnitudes
+    assert motions == pytest.approx(10.0 * np.sqrt(625e-6 + spin) / 100.0, rel=1e-6)
+    alone = bd.calibrate(dated, **options, requirements=need)
+    assert alone.margins[0].verdict == "undecided"

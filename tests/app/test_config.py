@@ -410,3 +410,41 @@ def test_a_unit_of_what_has_none_is_refused():
     error = refusal(of_kind("campaign", budget=[block | {"unit": "mas"}]))
     assert "has a unit of its own, and unit is 'mas'" in error.cause
     assert error.do == "leave unit out"
+
+
+@pytest.mark.parametrize(
+    ("sections", "message"),
+    [
+        ({"catalogue": {"name": "UKIDSS"}}, "no published errors are known .* Gaia DR3, Gaia EDR3"),
+        (
+            {
+                "catalogue": {"name": "Gaia DR3"},
+                "budget": [
+                    {
+                        "name": "Gaia",
+                        "kind": "systematic",
+                        "sigma_u": 1,
+                        "sigma_v": 1,
+                        "unit": "mas",
+                    }
+                ],
+            },
+            "states the errors of the catalogue, and so does the .*'Gaia'; leave one",
+        ),
+        (
+            {"data": None, "catalogue": {"name": "Gaia DR3"}, "selfcal": {"lists": "l"}},
+            "which a self-calibration does not use; leave it out",
+        ),
+    ],
+)
+def test_catalogues_that_cannot_be_used_are_refused(sections, message):
+    with pytest.raises(ConfigError, match=message):
+        parse_config(config_text(**sections), "c.toml")
+
+
+def test_a_catalogue_states_errors_of_positions_and_motions():
+    config = parse_config(config_text(catalogue={"name": "gaia edr3"}), "c.toml")
+    assert config.states_catalogue and config.states_motions
+    own = {"name": "A", "systematics_mas": 1.0, "correlation_deg": 1.0}
+    config = parse_config(config_text(catalogue=own), "c.toml")
+    assert config.states_catalogue and not config.states_motions

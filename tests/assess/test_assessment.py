@@ -130,7 +130,7 @@ def test_a_seed_is_that_of_a_run_and_a_generator_is_itself(shifting):
         ({"exposure": "sngle"}, "unknown exposure 'sngle'; use 'single'"),
         (
             {"catalogue": "Gaia"},
-            "catalogue: the catalogue is 'Gaia'; give its error too",
+            "catalogue: the catalogue is 'Gaia'; give an object, as in bd.Catalogue",
         ),
         ({"diagnostics": "none"}, "diagnostics: they are a str; give what bd.diagnose"),
         ({"chip": 9}, "9"),
@@ -205,7 +205,11 @@ def test_what_is_not_diagnosed(steps, given, words):
         (("", 1.0), {}, "has the name ''"),
         (("  ", 1.0), {}, "has the name '  '"),
         ((None, 1.0), {}, "has the name None"),
-        (("Gaia",), {}, "the size of its error is missing; give sigma_mas"),
+        (
+            ("Gaia",),
+            {},
+            "no published errors are known of a catalogue with this name, but of Gaia DR3",
+        ),
         (("Gaia", 1.0), {"sigma_mas": 1.0}, "the size of its error is given twice"),
         (("Gaia", -1.0), {}, "its error is -1.0 mas; give a number of 0 or more"),
         (("Gaia", float("nan")), {}, "its error is nan mas"),

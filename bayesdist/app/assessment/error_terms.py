@@ -37,7 +37,7 @@ def rehearsal_settings(run: Run) -> EvaluationSettings:
         single=config.assess.exposure == "single",
         # centroid errors estimated by the fit include no other errors
         contained=() if measured else config.held_in_residuals(run.model.unit),
-        given=tuple(block.name for block in config.budget if block.stated),
+        given=config.stated_errors,
         field=config.field,
     )
 

@@ -9,6 +9,7 @@ from pydantic import Field, PositiveFloat, field_validator
 from pydantic_core import PydanticCustomError
 
 from bayesdist.app.config.section import Circle, Epoch, Section, Unit
+from bayesdist.assess.terms.catalogue import Catalogue
 from bayesdist.assess.terms.correlated import (
     DEVIATIONS,
     FIELDS,
@@ -29,6 +30,7 @@ from bayesdist.assess.terms.parameters import (
     TIME_DEPENDENCE,
     one_size_kinds,
 )
+from bayesdist.errors import InputError
 
 Probability = Annotated[float, Field(gt=0, lt=1)]
 GridPoints = Annotated[int, Field(ge=2, le=10_000)]  # no more than a detector has pixels
@@ -107,6 +109,29 @@ class BudgetBlock(Section):
                 "included_in_scatter is of a random budget term, which scatters from star to star; "
                 "leave it out"
             )
+
+
+class CatalogueBlock(Section):
+    """Systematic errors of the reference catalogue, as published or as stated by the user."""
+
+    name: str
+    systematics_mas: PositiveFloat | None = None
+    motions_mas_yr: Annotated[float, Field(ge=0)] | None = None
+    correlation_deg: PositiveFloat | None = None
+    epoch: Epoch | None = None
+    bright_fraction: Annotated[float, Field(ge=0, le=1)] | None = None
+    source: str = ""
+
+    def faults(self) -> Iterator[str]:
+        """Faults of an unknown name, and of numbers that do not go together."""
+        try:
+            self.catalogue()
+        except InputError as error:
+            yield f"{error.where}: {error.cause}; {error.do}"
+
+    def catalogue(self) -> Catalogue:
+        """Catalogue of this section."""
+        return Catalogue(**self.model_dump())
 
 
 class RequirementBlock(Section):

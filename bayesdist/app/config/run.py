@@ -13,6 +13,7 @@ from bayesdist.app.config.assess import (
     MEASURED_TERMS,
     Assess,
     BudgetBlock,
+    CatalogueBlock,
     RequirementBlock,
 )
 from bayesdist.app.config.fit import (
@@ -43,7 +44,7 @@ from bayesdist.app.config.section import (
 from bayesdist.assess import Requirement, UserTerm
 from bayesdist.assess.domain import MIN_POSITIONS, WHOLE, Region, check_region, in_region
 from bayesdist.assess.terms.forms import ErrorTerm
-from bayesdist.assess.terms.given import said_by_user
+from bayesdist.assess.terms.given import names_motions, said_by_user, stated_names
 from bayesdist.assess.terms.parameters import one_size_term
 from bayesdist.assess.units import stated_unit
 from bayesdist.errors import InputError
@@ -98,6 +99,7 @@ class RunConfig(Section):
     detector: RunDetector = RunDetector()
     chip: list[ChipBlock] = Field(default_factory=list)
     assess: Assess = Assess()
+    catalogue: CatalogueBlock | None = None
     budget: list[BudgetBlock] = Field(default_factory=list)
     requirement: list[RequirementBlock] = Field(default_factory=list)
     discrepancy: DiscrepancyBlock = DiscrepancyBlock()
@@ -111,6 +113,12 @@ class RunConfig(Section):
             yield (
                 f"a [[budget]] block has the name {reserved!r}, which is that of a measured row; "
                 "give it another"
+            )
+        twice = next((b.name for b in self.budget if b.of_catalogue and b.stated), None)
+        if self.catalogue is not None and twice is not None:
+            yield (
+                f"[catalogue] states the errors of the catalogue, and so does the [[budget]] block "
+                f"{twice!r}; leave one of the two out"
             )
         yield from detector_faults(self.chip, self.detector, self.model.reference_pixel)
         if self.chip and self.detector.field is not None:
@@ -218,13 +226,21 @@ class RunConfig(Section):
 
     @property
     def states_catalogue(self) -> bool:
-        """True if a [[budget]] row states the error of the catalogue positions."""
-        return any(row.stated and row.of_catalogue for row in self.budget)
+        """True if [catalogue] or a [[budget]] row states the error of the catalogue positions."""
+        stated = any(row.stated and row.of_catalogue for row in self.budget)
+        return stated or self.catalogue is not None
 
     @property
     def states_motions(self) -> bool:
-        """True if a [[budget]] row states the error of proper motions."""
-        return any(row.stated and row.of_motions for row in self.budget)
+        """True if [catalogue] or a [[budget]] row states the error of proper motions."""
+        stated = any(row.stated and row.of_motions for row in self.budget)
+        return stated or any(map(names_motions, self.stated_errors))
+
+    @property
+    def stated_errors(self) -> tuple[str, ...]:
+        """Names of the errors that the user states, in the order of the budget."""
+        terms = [] if self.catalogue is None else [self.catalogue.catalogue().term()]
+        return (*stated_names(terms), *(block.name for block in self.budget if block.stated))
 
     def user_terms(self, unit: str = "pix") -> tuple[UserTerm, ...]:
         """User's terms of the error budget that do not depend on position.

@@ -8,11 +8,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, TypeVar
 
+import numpy as np
+
 from bayesdist.app.artefacts.stored_fit import read_stored_fit
 from bayesdist.app.kinds.further_exposures import FurtherExposures
 from bayesdist.app.kinds.sampling import sample_stars
 from bayesdist.app.run import Run
 from bayesdist.assess.model import with_diagnosed_errors
+from bayesdist.assess.terms.catalogue import fraction_of_bright
 from bayesdist.assess.terms.forms import ErrorTerm
 from bayesdist.data import MagnitudeErrors, Matches, ReferenceCatalog
 from bayesdist.diagnose.diagnostics import FittedStars
@@ -172,8 +175,18 @@ class RunKind(ABC, Generic[C, I]):
 
     def error_terms(self, run: Run, solution: Solution) -> list[ErrorTerm]:
         """Errors of positions beside those of the solution: those that the user states."""
-        config = run.config
-        return [*config.linear_terms(solution), *config.user_terms(solution.model.unit)]
+        return [*run.config.linear_terms(solution), *self.stated_terms(run, solution)]
+
+    def stated_terms(self, run: Run, solution: Solution) -> list[ErrorTerm]:
+        """Errors of the catalogue, and those that are stated with one sigma on each axis."""
+        config, out = run.config, list[ErrorTerm]()
+        if config.catalogue is not None:
+            dates = run.dates
+            if not dates.size and config.assess.epoch is not None:
+                dates = np.array([config.assess.epoch])
+            bright = fraction_of_bright(run.sample)
+            out.append(config.catalogue.catalogue().term(dates, bright))
+        return [*out, *config.user_terms(solution.model.unit)]
 
     def domain(self, run: Run) -> EvaluationDomain:
         """The exposure that errors are evaluated for."""

@@ -345,14 +345,14 @@ def catalogue_checks(catalogue_stated: bool | None) -> Iterator[Check]:
     """Check that errors of the reference catalogue are stated; no check without a catalogue."""
     if catalogue_stated is None:
         return
-    name, limit = "Error of the reference catalogue", "a row of [[budget]] or of the table"
+    name, limit = "Error of the reference catalogue", "[catalogue], a row of [[budget]] or table"
     if catalogue_stated:
         yield Check(GROUP, name, "stated", limit, "pass")
         return
     sentence = (
-        "no error of the reference catalogue is stated: give a [[budget]] row that is named after "
-        "the catalogue, such as 'Gaia DR3', or in Python catalogue=bd.Catalogue('Gaia DR3', "
-        "sigma_mas=...); an error of 0 needs a source"
+        "no error of the reference catalogue is stated: name a catalogue with published errors, as "
+        "[catalogue] name = 'Gaia DR3' or in Python catalogue=bd.Catalogue('Gaia DR3'), or give a "
+        "[[budget]] row that is named after the catalogue; an error of 0 needs a source"
     )
     yield Check(GROUP, name, "not stated", limit, "warn", sentence, LARGER)
 

@@ -6,13 +6,14 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.terms.forms import (
     GIVEN,
+    LOCAL,
     PUBLISHED,
     ErrorDraws,
     ErrorTerm,
@@ -78,21 +79,25 @@ def stated_names(terms: Sequence[ErrorTerm]) -> tuple[str, ...]:
     """Names of the terms that state an error, in order."""
     names = []
     for term in terms:
-        sizes = [1.0]  # of terms that compute their size
+        sizes: list[float | None] = [1.0]  # of terms that compute their size
         if isinstance(term, UserTerm):
             sizes = [term.sigma_u, term.sigma_v]
         elif isinstance(term, SizedTerm):
             sizes = [term.sigma]
-        row = term.rows[0]
-        if is_stated(sizes, row.source):
-            names.append(row.name)
+        if is_stated(sizes, term.rows[0].source):
+            # parts of an error that vary over the field are implied by its other rows
+            wide = [row.name for row in term.rows if row.kind != LOCAL]
+            names += wide or [term.rows[0].name]
     return tuple(names)
 
 
-def _sizes(
+def sizes_of(
     sizes: Sequence[Number], unit: str, what: str, where: str
 ) -> tuple[tuple[float, ...], str]:
-    """Standard deviations and their unit: `unit` for plain numbers, else that of the Quantities."""
+    """Standard deviations and their unit: `unit` for plain numbers, else that of the Quantities.
+
+    `what` and `where` are for error messages.
+    """
     units = [unit_name(size, what, where=where) for size in sizes]
     if None in units and any(units):
         raise InputError(
@@ -157,7 +162,7 @@ class UserTerm:
         require_known(self.kind, TERM_KINDS, "kind", where=location)
         if self.unit is not None:
             require_known(self.unit, UNITS, "unit", where=location)
-        (sigma_u, sigma_v), unit = _sizes(
+        (sigma_u, sigma_v), unit = sizes_of(
             (self.sigma_u, self.sigma_v), self.unit or "", "sigma", location
         )
         varies = names_catalogue(self.name) if self.varies is None else self.varies
@@ -268,129 +273,6 @@ class UserTerm:
         if not (self.varies and self.kind == "systematic" and (self.sigma_u or self.sigma_v)):
             return ()
         return SmoothTerm(self, model, grid or DEFAULT_GRID), replace(self, kind="random")
-
-
-def require_catalogue(catalogue: object) -> None:
-    """Raise InputError if an argument is neither a Catalogue nor None."""
-    if not isinstance(catalogue, Catalogue | None):
-        raise InputError(
-            f"the catalogue is {catalogue!r}",
-            where="catalogue",
-            do="give its error too, as in bd.Catalogue('Gaia DR3', sigma_mas=0.3)",
-        )
-
-
-@dataclass(frozen=True, init=False)
-class Catalogue:
-    """The systematic error of the positions in the reference catalogue, as the user states it.
-
-    It corresponds to the ``[[budget]]`` row of a configuration with the same name, sizes and
-    source. A verdict needs it, because matched stars cannot reveal an error that is common to all
-    stars of the catalogue.
-
-    Parameters
-    ----------
-    name : str
-        Name of the catalogue, such as 'Gaia DR3'.
-    sigma : float or Quantity, or a pair of them
-        Standard deviation of the positions, for both axes or along u and v; stored as a pair.
-    unit : str
-        'pix', 'arcsec', 'mas' or 'deg'; ignored for Quantities.
-    source : str
-        Origin of the number. A size of 0 needs a source.
-    sigma_mas : float, optional
-        Size in milliarcseconds, instead of `sigma`.
-
-    Raises
-    ------
-    InputError
-        If the name is empty or that of proper motions, the size is missing or given twice, a size
-        is negative or not finite, a size of 0 has no source, or the unit is unknown.
-
-    Examples
-    --------
-    >>> catalogue = bd.Catalogue("Gaia DR3", sigma_mas=0.3, source="Lindegren et al. 2021")
-    >>> catalogue.sigma, catalogue.unit
-    ((0.3, 0.3), 'mas')
-    >>> catalogue.term().source
-    'given by the user: Lindegren et al. 2021'
-    """
-
-    name: str
-    sigma: tuple[float, float]
-    unit: str
-    source: str
-
-    def __init__(
-        self,
-        name: str,
-        sigma: Number | tuple[Number, Number] | None = None,
-        unit: str = "mas",
-        source: str = "",
-        *,
-        sigma_mas: float | None = None,
-    ) -> None:
-        if not (isinstance(name, str) and name.strip()):
-            raise InputError(
-                f"the reference catalogue has the name {name!r}",
-                where="catalogue",
-                do="give its name, as in bd.Catalogue('Gaia DR3', sigma_mas=0.3)",
-            )
-        location = f"catalogue {name!r}"
-        if names_motions(name):
-            raise InputError(
-                "the name is that of proper motions, and the error is that of positions",
-                where=location,
-                do="name the catalogue, and give errors of its motions as a UserTerm",
-            )
-        require_known(unit, UNITS, "unit", where=location)
-        if (sigma is None) == (sigma_mas is None):
-            problem = "missing" if sigma is None else "given twice"
-            raise InputError(
-                f"the size of its error is {problem}",
-                where=location,
-                do="give sigma_mas, or sigma with its unit; 0 with its source where it has none",
-            )
-        size_argument: Any = sigma if sigma_mas is None else sigma_mas
-        several = isinstance(size_argument, tuple | list) or getattr(size_argument, "ndim", 0) > 0
-        pair = tuple(size_argument) if several else (size_argument, size_argument)
-        if len(pair) != 2:
-            raise InputError(
-                f"its error has {len(pair)} sizes",
-                where=location,
-                do="give one, or those of u and v",
-            )
-        sizes, unit = _sizes(pair, unit if sigma_mas is None else "mas", "sigma", location)
-        for size in sizes:
-            if not (math.isfinite(size) and size >= 0):
-                raise InputError(
-                    f"its error is {size} {unit}", where=location, do="give a number of 0 or more"
-                )
-        if not is_stated(sizes, source):
-            raise InputError(
-                "its error is 0, and no source is given for that",
-                where=location,
-                do="give the source, or the size of its error",
-            )
-        for field, value in (("name", name), ("sigma", sizes), ("unit", unit), ("source", source)):
-            object.__setattr__(self, field, value)
-
-    @property
-    def row_name(self) -> str:
-        """Name of its row of the budget, which always identifies it as a catalogue."""
-        return self.name if names_catalogue(self.name) else f"reference catalogue {self.name}"
-
-    def term(self) -> UserTerm:
-        """Term of the error budget, equal to the one that a configuration row produces."""
-        source = said_by_user(self.source)
-        return UserTerm(self.row_name, "systematic", *self.sigma, self.unit, source, varies=True)
-
-    def budget_row(self) -> dict[str, str | float]:
-        """Keys and values of the ``[[budget]]`` row in a configuration."""
-        sigma_u, sigma_v = self.sigma
-        row: dict[str, str | float] = {"name": self.row_name, "kind": "systematic"}
-        row |= {"sigma_u": sigma_u, "sigma_v": sigma_v, "unit": self.unit}
-        return row | ({"source": self.source} if self.source.strip() else {})
 
 
 def _everywhere(size: Float, domain: EvaluationDomain) -> Float:

@@ -165,7 +165,7 @@ class CampaignKind(RunKind[CampaignConfig, Inputs]):
             scatter.tau,
             aberration=aberration_term(scatter.kinds, scatter.tau, run.inputs, solution),
         )
-        stated = config.user_terms(solution.model.unit)
+        stated = self.stated_terms(run, solution)
         tables = _table_terms(run, solution)
         return [deviation, *config.linear_terms(solution), *tables, *stated]
 

@@ -156,6 +156,11 @@ class SelfcalConfig(RunConfig):
     def faults(self) -> Iterator[str]:
         """Faults of any run, and of settings that contradict the frames or need a scale."""
         yield from super().faults()
+        if self.catalogue is not None:
+            yield (
+                "[catalogue] states the errors of reference positions, which a self-calibration "
+                "does not use; leave it out"
+            )
         if names_nominal(self.selfcal.columns):
             yield (
                 "nominal positions are of matches in [data], and a [selfcal] finds its matches "

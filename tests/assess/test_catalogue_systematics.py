@@ -1,0 +1,232 @@
+"""Systematic errors of a catalogue: their covariance over the field, growth and coverage."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import bayesdist as bd
+from bayesdist.assess import Catalogue
+from bayesdist.assess.model import error_model
+from bayesdist.assess.terms.catalogue import PUBLISHED_SYSTEMATICS
+from bayesdist.errors import InputError
+from bayesdist.model import Chip, DistortionModel
+from tests.assess.drawn_fields import fields_at
+from tests.reduced import FULL
+
+SIZE = (2001.0, 1001.0)
+CENTRE = (1001.0, 501.0)
+EPOCH = 2016.0
+N = 4000
+
+
+def gaia_motions(theta):
+    """Lindegren et al. 2021, Eq. 25, and 25 microarcsec per year in all; mas^2 and degrees."""
+    return 1e-6 * (292.0 * np.exp(-theta / 12.0) + 333.0 * np.exp(-theta / 0.25))
+
+
+def gaia_positions(theta):
+    """As motions of one year, and half of the variance of parallaxes with their zero point."""
+    return gaia_motions(theta) + 0.5e-6 * (142.0 * np.exp(-theta / 16.0) + 400.0)
+
+
+@pytest.fixture
+def pixels(solution_of):
+    """Maker of a solution with u, v in pixels; two chips, the second above the first."""
+
+    def make(n_chips=1):
+        chips = tuple(Chip(k + 1, "AB"[k], SIZE, CENTRE) for k in range(n_chips))
+        model = DistortionModel(1, chips, unit="pix")
+        mean = np.zeros(model.n_params)
+        for k, chip in enumerate(chips):
+            basis = model.basis(chip.number)
+            for axis in (0, 1):
+                monomials = np.zeros(basis.n_terms)
+                monomials[basis.terms.index((1, 0) if axis == 0 else (0, 1))] = 1.0
+                monomials[0] = 1100.0 * k * axis
+                mean[model.coefficient_slice(chip.number, axis)] = basis.from_monomials(monomials)
+        return solution_of(model, mean=mean)
+
+    return make
+
+
+def drawn(solution, catalogue, dates=(EPOCH,), *, scale=50.0, bright=0.0, n=N, seed=1):
+    term = catalogue.term(np.array(dates), bright)
+    return error_model(solution, [term], pixel_scale=scale).drawn(n, np.random.default_rng(seed))
+
+
+def summed(fields, names):
+    return sum(fields.field(name) for name in names)
+
+
+@pytest.mark.parametrize("scale", [20.0, 200.0, 3000.0])  # fields of 0.01 to 1.7 degrees
+def test_draws_have_the_published_covariance_at_any_separation(pixels, scale):
+    """Between positions of both chips, in pixels: V(theta) of the papers."""
+    draws = drawn(pixels(2), Catalogue("Gaia DR3"), scale=scale)
+    rng = np.random.default_rng(3)
+    x, y = rng.uniform(1, SIZE[0], (2, 40)), rng.uniform(1, SIZE[1], (2, 40))
+    names = ("Gaia DR3", "Gaia DR3 (over the field)")
+    errors = np.concatenate(
+        [summed(fields_at(draws, x[k], y[k], chip=k + 1), names) for k in (0, 1)], axis=1
+    )
+    v = y + np.array([0.0, 1100.0])[:, None]
+    x, v = x.ravel() * scale / 3.6e6, v.ravel() * scale / 3.6e6
+    theta = np.hypot(x[:, None] - x, v[:, None] - v)
+    expected = gaia_positions(theta) / scale**2
+    n = 1000  # different draws
+    for axis in (0, 1):
+        found = errors[:n, :, axis].T @ errors[:n, :, axis] / n
+        # 6 sigma of 3,200 covariances, and the functions that represent the rest
+        assert np.abs(found / expected[0, 0] - expected / expected[0, 0]).max() < 0.27
+        together = np.abs(np.mean(found - expected)) / expected[0, 0]
+        assert together < 5 * np.sqrt(2 / n)
+        # differences, for which the common part cancels: by their distance
+        apart = np.array([(errors[:n, i, axis] - errors[:n, j, axis]) for i, j in PAIRS])
+        ratio = np.mean(apart**2, axis=1) / [
+            2 * (expected[0, 0] - expected[i, j]) for i, j in PAIRS
+        ]
+        assert np.median(ratio) == pytest.approx(1.0, abs=0.05)
+        assert np.all((ratio > 0.6) & (ratio < 1.6))
+    assert abs(np.mean(errors[:n, :, 0] * errors[:n, :, 1])) < 0.1 * expected[0, 0]
+
+
+PAIRS = [(i, j) for i in range(80) for j in range(i)]
+
+
+@pytest.mark.parametrize("scale", [50.0, 500.0])
+def test_mean_squares_are_exact_at_positions_and_for_differences(pixels, scale):
+    solution = pixels()
+    draws = drawn(solution, Catalogue("Gaia DR3"), scale=scale)
+    rng = np.random.default_rng(4)
+    fields = fields_at(draws, rng.uniform(1, SIZE[0], 300), rng.uniform(1, SIZE[1], 300))
+    names = [name for name in fields.parts if name.startswith("Gaia")]
+    assert names[:2] == ["Gaia DR3", "Gaia DR3 (over the field)"]
+    total = sum(np.square(fields.sigma(name)) for name in names[:2])
+    np.testing.assert_allclose(total, gaia_positions(0.0) / scale**2, rtol=1e-6)
+    constant, rest = (np.square(fields.sigma(name)).mean() for name in names[:2])
+    assert rest < constant  # of a small field
+
+
+def test_the_rest_is_independent_of_constant_and_tilt(pixels):
+    draws = drawn(pixels(), Catalogue("Gaia DR3"))
+    x, y = (a.ravel() for a in np.meshgrid(np.linspace(1, SIZE[0], 9), np.linspace(1, SIZE[1], 9)))
+    fields = fields_at(draws, x, y)
+    tilt, rest = (fields.field(name)[:1000, :, 0] for name in fields.parts[1:3])
+    plane = np.column_stack([np.ones_like(x), x, y])
+    residual = tilt - (plane @ np.linalg.lstsq(plane, tilt.T, rcond=None)[0]).T
+    assert np.abs(residual).max() < 1e-9 * tilt.std()
+    correlation = (tilt.T @ rest) / 1000 / np.outer(tilt.std(axis=0), rest.std(axis=0))
+    assert np.abs(correlation).max() < 6 / np.sqrt(1000)
+
+
+@pytest.mark.parametrize(("dates", "years"), [([2006.0], -10.0), ([2024.0, 2026.0], 9.0)])
+def test_errors_of_motions_grow_with_the_time_from_the_epoch(pixels, dates, years):
+    fields = fields_at(drawn(pixels(), Catalogue("Gaia DR3"), dates), CENTRE[:1], CENTRE[1:])
+    names = [name for name in fields.parts if "motions" in name]
+    total = sum(np.square(fields.sigma(name)) for name in names)
+    np.testing.assert_allclose(total, years**2 * gaia_motions(0.0) / 50.0**2, rtol=1e-6)
+
+
+def test_the_frame_of_bright_stars_rotates(pixels):
+    """Cantat-Gaudin & Brandt 2021: up to 0.08 mas/yr; w^2 / 3 on an axis in the mean of the sky."""
+    square = {}
+    for bright in (0.0, 0.5, 1.0):
+        fields = fields_at(
+            drawn(pixels(), Catalogue("Gaia DR3"), [2026.0], bright=bright), 9.0, 9.0
+        )
+        names = [name for name in fields.parts if "motions" in name]
+        square[bright] = sum(np.square(fields.sigma(name)) for name in names).mean()
+    spin = 10.0**2 * 0.08**2 / 3.0 / 50.0**2
+    assert square[1.0] - square[0.0] == pytest.approx(spin, rel=1e-6)
+    assert square[0.5] - square[0.0] == pytest.approx(spin / 4, rel=1e-6)
+    told = Catalogue("Gaia DR3", bright_fraction=0.5)
+    fields = fields_at(drawn(pixels(), told, [2026.0], bright=1.0), 9.0, 9.0)
+    again = sum(np.square(fields.sigma(n)) for n in fields.parts if "motions" in n).mean()
+    assert again == pytest.approx(square[0.5], rel=1e-12)
+
+
+def test_numbers_of_the_user_replace_published_ones(pixels):
+    own = {"systematics_mas": 2.0, "correlation_deg": 0.1, "motions_mas_yr": 0.5, "epoch": 2000.0}
+    for name in ("Gaia DR3", "UKIDSS"):
+        draws = drawn(pixels(), Catalogue(name, **own, source="a paper"), [2010.0])
+        fields = fields_at(draws, CENTRE[:1], CENTRE[1:])
+        parts = [part for part in fields.parts if name in part]
+        assert parts[0] == ("Gaia DR3" if name == "Gaia DR3" else "reference catalogue UKIDSS")
+        square = [np.square(fields.sigma(part)) for part in parts]
+        np.testing.assert_allclose(square[0] + square[1], 4.0 / 50.0**2, rtol=1e-6)
+        np.testing.assert_allclose(square[2] + square[3], 25.0 / 50.0**2, rtol=1e-6)
+        (row,) = [r for field in draws.at(fields.domain) for r in field.rows if r.name == parts[0]]
+        assert row.source == "given by the user: a paper"
+
+
+def test_every_published_catalogue_makes_positive_covariances(pixels):
+    for name, systematics in PUBLISHED_SYSTEMATICS.items():
+        fields = fields_at(drawn(pixels(), Catalogue(name), [2020.0]), CENTRE[:1], CENTRE[1:])
+        parts = [part for part in fields.parts if part.startswith(name)]
+        assert np.all(np.concatenate([fields.sigma(part) for part in parts[:1]]) > 0), name
+        assert systematics.source.startswith("published: ")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"name": "UKIDSS"}, "no published errors .* but of Gaia DR3, Gaia EDR3, .* give syst"),
+        ({"name": "UKIDSS", "systematics_mas": 1.0}, "without correlation_deg"),
+        ({"name": "Gaia DR3", "correlation_deg": 1.0}, "without systematics_mas"),
+        ({"name": "Gaia DR3", "motions_mas_yr": 1.0}, "without systematics_mas"),
+        ({"name": "A", "systematics_mas": -1.0, "correlation_deg": 1.0}, "systematics_mas is -1"),
+        ({"name": "A", "systematics_mas": 1.0, "correlation_deg": 0.0}, "correlation_deg is 0"),
+        ({"name": "Gaia DR3", "bright_fraction": 1.5}, "bright_fraction is 1.5"),
+        ({"name": "Gaia DR3", "sigma": 1.0, "systematics_mas": 1.0}, "sigma and systematics_mas"),
+        (
+            {"name": "A", "systematics_mas": 1.0, "correlation_deg": 1.0, "motions_mas_yr": 1.0},
+            "motions_mas_yr is given without epoch",
+        ),
+    ],
+)
+def test_a_catalogue_that_says_too_little_or_too_much_is_refused(options, message):
+    with pytest.raises(InputError, match=message):
+        Catalogue(**options)
+
+
+def test_without_dates_or_scale_nothing_is_guessed(pixels):
+    with pytest.raises(InputError, match="date of the exposures is not known"):
+        drawn(pixels(), Catalogue("Gaia DR3"), dates=())
+    with pytest.raises(InputError, match="without a pixel scale"):
+        drawn(pixels(), Catalogue("Gaia DR3"), scale=None)
+
+
+# -- coverage -------------------------------------------------------------------------------------
+
+TRUTHS = 1000 if FULL else 200
+NOISE = 2e-4  # pix, of one star
+
+
+@pytest.mark.parametrize("years", [0.0, 10.0])
+def test_stated_errors_cover_calibrations_on_a_catalogue_with_this_covariance(years):
+    """Fits to stars whose catalogue errors are exact draws of V(theta), at one place and across."""
+    scale, n, rng = 100.0, 150, np.random.default_rng(int(years) + 8)
+    probes = np.array([[300.0, 200.0], [1800.0, 900.0]])
+    catalogue, hits = Catalogue("Gaia DR3", bright_fraction=0.0), {"place": [], "across": []}
+    for _ in range(TRUTHS):
+        x, y = rng.uniform(1, SIZE[0], n), rng.uniform(1, SIZE[1], n)
+        theta = np.hypot(x[:, None] - x, y[:, None] - y) * scale / 3.6e6
+        V = (gaia_positions(theta) + years**2 * gaia_motions(theta)) / scale**2
+        field = rng.standard_normal((2, n)) @ np.linalg.cholesky(V).T
+        u, v = np.stack([x - CENTRE[0], y - CENTRE[1]]) + field + NOISE * rng.normal(size=(2, n))
+        stars = bd.Matches(x=x, y=y, u=u, v=v, sigma_u=np.full(n, NOISE), sigma_v=np.full(n, NOISE))
+        model = bd.build_model(stars, order=1, size=SIZE, reference_pixel=CENTRE)
+        fit = bd.fit_linear(stars, model)
+        term = catalogue.term([EPOCH + years])
+        fields = fields_at(error_model(fit, [term], pixel_scale=scale).drawn(300, rng), *probes.T)
+        joint = fields.field("model")
+        found = np.reshape(fit.mean, (2, -1)) @ fit.model.basis().evaluate(*probes.T).T
+        error = found - (probes - CENTRE).T
+        hits["place"] += [error[a, 0] / joint[:, 0, a].std() for a in (0, 1)]
+        apart = joint[:, 1] - joint[:, 0]
+        hits["across"] += [(error[a, 1] - error[a, 0]) / apart[:, a].std() for a in (0, 1)]
+    spread = 4 * np.sqrt(0.25 / (2 * TRUTHS))
+    for name, deviations in hits.items():
+        z = np.abs(deviations)
+        assert np.mean(z < 1.0) == pytest.approx(0.683, abs=spread), name
+        assert np.mean(z < 1.96) == pytest.approx(0.95, abs=spread), name
