@@ -75,9 +75,10 @@ PIXEL_PHASE = Family(
 )
 CUT_OFF = Family(
     "cut-off positions",
-    "give all positions with all of their digits, or add half a step to those that were cut off",
-    "stars whose positions have few digits are displaced from the others",
-    "stars whose positions have few digits are not displaced from the others",
+    "give all pixel coordinates with all of their digits, or add half a step to those that were "
+    "cut off",
+    "stars whose pixel coordinates have few digits are displaced from the others",
+    "stars whose pixel coordinates have few digits are not displaced from the others",
 )
 MAGNITUDE_IN_TIME = Family(
     "magnitude in time",
