@@ -178,18 +178,15 @@ class Diagnostics:
     @property
     def checks_of_input(self) -> tuple[Check, ...]:
         """Checks of the fit and its matching, taking the results of the tests into account."""
-        findings = {
-            # sizes per year are not comparable, and are taken to explain everything
-            test.name: test.size if test.unit == self.misfit.unit else np.inf
-            for test in self.score_tests
-            if test.significant and test.held_by != "noise"
-        }
+        findings = [
+            test.name for test in self.score_tests if test.significant and test.held_by != "noise"
+        ]
         if any(misfit.significant for misfit in self.misfits):
-            findings["structure in the residuals"] = self.misfit.structure
+            findings.append("structure in the residuals")
         if self.correlated is not None and self.correlated.facts.get("exposures_outlying"):
-            findings["exposures that deviate far more than the others"] = np.inf
+            findings.append("exposures that deviate far more than the others")
         if self.majority:
-            findings["more false than true pairs"] = np.inf
+            findings.append("more false than true pairs")
         return self.chi_square.check(findings), *self.input_checks
 
     @property
@@ -487,7 +484,7 @@ def diagnose_fit(
             fit.dof,
             in_circle,
             explained_by_false_matches(posterior, sigma),
-            sigma if eliminated is None else None,
+            eliminated is None,
             "" if match_radius is None else _radius_doubt(sample, match_radius),
         ),
         input_checks=tuple(checks),

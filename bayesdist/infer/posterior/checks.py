@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,7 +27,6 @@ from bayesdist.utils.limits import (
 from bayesdist.utils.numbers import count, number, percent
 
 FIT, SAMPLING = "Fit", "Sampling"
-EXPLAINED = 0.5  # fraction of the excess of chi-square that findings must explain
 
 
 def scatter_too_small(total: float, dof: float) -> bool:
@@ -54,9 +53,9 @@ class ChiSquare:
     false_matches : bool
         True if the posterior attributes residuals that are too large to false matches and finds
         the quoted errors correct.
-    quoted : float or None
-        Typical quoted error of a star per axis, in the unit of u and v, if it includes errors of a
-        reference catalogue; None if it is that of the centroids alone.
+    catalogue : bool
+        True if u and v are positions of a reference catalogue, whose errors the quoted ones
+        include.
     radius_doubt : str
         Clause on a stated match radius that no match comes near; empty if there is none.
     """
@@ -65,32 +64,20 @@ class ChiSquare:
     dof: float
     in_circle: bool = False
     false_matches: bool = False
-    quoted: float | None = None
+    catalogue: bool = True
     radius_doubt: str = ""
 
-    def check(self, findings: Mapping[str, float] | None = None) -> Check:
+    def check(self, findings: Sequence[str] = ()) -> Check:
         """Check that chi-square is about one per degree of freedom.
 
-        Parameters
-        ----------
-        findings : mapping of str to float, optional
-            Other findings in the residuals, such as missing terms, and the rms of each over the
-            detector, both axes together, in the unit of u and v; infinite if it explains any
-            residuals.  If findings explain the residuals, these are no evidence against the quoted
-            errors.
-
-        Returns
-        -------
-        Check
-            If stars scatter more than quoted, and no finding explains it, it is unknown whether the
-            centroids or the catalogue cause it.  Errors of the catalogue may be common to all
-            stars, which the jitter does not include, so that no requirement counts as met.
+        `findings` are the names of other findings in the residuals, such as missing terms.  If the
+        model does not describe the positions, large residuals are no evidence against the quoted
+        errors.
         """
-        findings = findings or {}
         ratio = self.total / self.dof if self.dof > 0 else float("nan")
         small = scatter_too_small(self.total, self.dof)
         doubt = EITHER if small and not self.in_circle else ""
-        if self._doubts_catalogue(ratio, findings):
+        if self._large(ratio) and self.radius_doubt and not findings:
             doubt = LARGER
         return Check(
             FIT,
@@ -102,15 +89,11 @@ class ChiSquare:
             doubt,
         )
 
-    def _doubts_catalogue(self, ratio: float, findings: Mapping[str, float]) -> bool:
-        """True if the catalogue may be the cause of a large chi-square per degree of freedom."""
-        if self.quoted is None or self.false_matches or not ratio > CHI2_TOO_LARGE.value:
-            return False
-        # mean square over both axes
-        excess = 2 * (ratio - 1.0) * self.quoted**2
-        return sum(size**2 for size in findings.values()) < EXPLAINED * excess
+    def _large(self, ratio: float) -> bool:
+        """True if chi-square is large for reasons that the posterior does not explain."""
+        return ratio > CHI2_TOO_LARGE.value and not self.false_matches
 
-    def _sentence(self, small: bool, findings: Mapping[str, float]) -> str:
+    def _sentence(self, small: bool, findings: Sequence[str]) -> str:
         """Sentence on a chi-square that is not about one; empty where it is."""
         ratio = self.total / max(self.dof, 1)
         if small and self.in_circle:
@@ -133,14 +116,14 @@ class ChiSquare:
                 "errors of the others as they are"
             )
         why = "they are too small, which the jitter takes up, or the model does not fit"
-        if self._doubts_catalogue(ratio, {}):
+        if self.catalogue:
             why = (
                 "if centroids cause it, they are too small, and the jitter takes it up; if the "
-                "catalogue does, as with motions since its epoch, stars may also be displaced "
-                "together by more than its stated error: state the errors of both as they are"
+                "catalogue does, as with motions since its epoch, all stars may also be displaced "
+                "together, by more than its stated error: state the errors of both as they are"
             )
-            if self.radius_doubt:
-                why = f"{self.radius_doubt}; otherwise, {why}"
+        if self.radius_doubt:
+            why = f"{self.radius_doubt}; otherwise, {why}"
         if findings:
             why = (
                 f"the model does not describe all positions ({', '.join(findings)}): follow that "
