@@ -284,6 +284,7 @@ def test_breaks_have_data_on_both_sides():
 
 # -- configurations -------------------------------------------------------------------------------
 
+REQUIREMENT = '[[requirement]]\nname = "a"\nstatistic = "max"\nlimit = 1\nregion = '
 DEEP = "[" * 3000 + "]" * 3000
 
 
@@ -304,6 +305,30 @@ DEEP = "[" * 3000 + "]" * 3000
         ({"more": "[assess]\ngrid = [100000, 100000]"}, "assess.grid[1]: 100000 does not fit"),
         ({"more": "[assess]\ndraws = 1000000000"}, "assess.draws: 1000000000 does not fit"),
         ({"more": "[sampler]\nensembles = 1000000"}, "sampler.ensembles: 1000000 does not fit"),
+        (
+            {"detector": "field = [[1, 1], [nan, 9], [9, 9]]"},
+            "field[2][1]: nan does not fit; give a fi",
+        ),
+        (
+            {"detector": "field = [[1, 1], [9, 9, 9]]"},
+            "field[2]: [9, 9, 9] does not fit; give at most 2",
+        ),
+        (
+            {"detector": "field = [[1, 1], [9, 9]]"},
+            "c.toml: detector.field: a polygon of 2 corners",
+        ),
+        (
+            {"detector": "field = {centre = [nan, 9], radius = 9}"},
+            "field.centre[1]: nan does not fit; ",
+        ),
+        (
+            {"more": f"{REQUIREMENT}[[1, 1], [9, inf]]"},
+            "region[2][2]: inf does not fit; give a finite",
+        ),
+        (
+            {"more": f"{REQUIREMENT}{{radius = nan}}"},
+            "requirement[1].region.centre: this value is m",
+        ),
         ({"more": 2 * '[[prior]]\nparameter = "u_1_0"\nmean = 1\nsigma = 1\n'}, "two [[prior]]"),
     ],
 )

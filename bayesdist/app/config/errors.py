@@ -42,7 +42,7 @@ def as_config_error(
     the section that distinguishes them.
     """
     # an unknown key is usually the cause of a missing one
-    details = sorted(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
+    details = sorted(_of_innermost(error.errors()), key=lambda e: e["type"] != "extra_forbidden")
     first = details[0]
     if isinstance(kinds, Mapping):
         for detail in details:
@@ -65,6 +65,16 @@ def as_config_error(
         where=f"{where}: {key}",
         do="give " + " or ".join(wanted),
     )
+
+
+def _of_innermost(details: Sequence[Any]) -> list[Any]:
+    """Errors without those of a value for which there are also errors of its elements.
+
+    Only the types of a union that the value as a whole does not fit give such errors.
+    """
+    paths = [tuple(part for part in d["loc"] if not _is_branch(part)) for d in details]
+    outer = {path[:n] for path in paths for n in range(len(path))}
+    return [d for d, path in zip(details, paths, strict=True) if path not in outer]
 
 
 def _unknown_key(kinds: Mapping[str, Kind], kind: str, location: Location) -> tuple[str, str]:
@@ -94,6 +104,13 @@ def _wanted(detail: Any) -> str:
         return "its header double brackets, for there may be several"
     if detail["type"] in _KINDS:
         return _KINDS[detail["type"]]
+    for kind, limit, words in (
+        ("too_long", "max_length", "most"),
+        ("too_short", "min_length", "least"),
+    ):
+        if detail["type"] == kind:
+            n = detail["ctx"][limit]
+            return f"at {words} {n} value{'s' if n != 1 else ''}"
     wanted = detail["msg"].removeprefix("Input should be ")
     if wanted.startswith(("greater", "less")):
         return f"a number {wanted}"

@@ -281,6 +281,7 @@ def _validated(
     """Validate settings; `kinds` are the models, for errors."""
     try:
         # validated as JSON, in which arrays may become tuples but text does not become a number
-        return adapter.validate_json(json.dumps(raw, default=str), strict=True)
+        with _as_config_errors(where):
+            return adapter.validate_json(json.dumps(raw, default=str), strict=True)
     except ValidationError as error:
         raise as_config_error(kinds, error, where) from error
