@@ -176,8 +176,8 @@ def of_exposures(rng: np.random.Generator) -> dict[str, float]:
     priors = DiscrepancyPriors()
     return {
         SCATTER: half_t(rng, priors.exposure, MOST_SCATTER * priors.exposure, dof=1.0),
-        SECOND_ORDER: half_t(rng, priors.higher_order, MOST, dof=1.0),
-        FIELDS: half_t(rng, priors.structure, MOST, dof=1.0),
+        SECOND_ORDER: half_t(rng, priors.higher_order, MOST),
+        FIELDS: half_t(rng, priors.structure, MOST),
     }
 
 

@@ -188,6 +188,15 @@ def test_errors_in_the_mean_and_in_one_exposure_are_those_of_the_truth(kind):
         assert 9 < alone / mean < 40
 
 
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_field_too_faint_to_be_significant_still_has_an_error(seed):
+    """Its rms is a third of a star's error, and no test needs to find it."""
+    rms = 0.006
+    _, discrepancy, fit = found(field(rms, 100.0, seed), seed)
+    stated = np.sqrt(2 * variance_over_detector(discrepancy, fit, single=True))
+    assert 0.4 * rms < stated < 1.6 * rms
+
+
 def test_one_exposure_that_is_turned_is_set_aside_and_named():
     scene = replace(SCENE, frames="none")
 

@@ -33,6 +33,7 @@ from bayesdist.diagnose.correlated.neighbours import (
     modes,
 )
 from bayesdist.diagnose.correlated.priors import (
+    STRUCTURE_DOF,
     DiscrepancyPriors,
     log_half_t,
     log_widths,
@@ -312,12 +313,13 @@ def _amplitudes(median: float, resolved: float, largest: float) -> tuple[Float, 
     """Grid of amplitudes (STEPS,), and log prior weights for a sum over them.
 
     The grid extends beyond the prior median, the resolution of the data, and the largest size that
-    the data suggest.
+    the data suggest, where the likelihood is negligible: even two exposures have many terms and
+    patches, whose scatter they determine.
     """
     grid = np.geomspace(
         min(median, resolved) / RANGE, RANGE * max(median, resolved, largest), STEPS
     )
-    return grid, log_half_t(grid, median) + log_widths(grid)
+    return grid, log_half_t(grid, median, STRUCTURE_DOF) + log_widths(grid, beyond=0.0)
 
 
 def _with_loose(terms: _Terms, start: float) -> _Terms:

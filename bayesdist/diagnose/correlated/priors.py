@@ -7,11 +7,11 @@ Biometrika 97, 465).  A larger median increases the errors of calibrations witho
 discrepancy; a lighter tail resists a discrepancy that stars begin to show.  The tails differ
 according to the information in the data:
 
-- structure: half-t with `STRUCTURE_DOF` degrees of freedom, nearly flat in the logarithm from the
-  median up to the error of a star, at which it ends.  The data dominate as soon as stars show
-  structure.
-- scatter of exposures, curvature of drifts, errors of catalogue stars: half-Cauchy.  Two or three
-  exposures hardly constrain a scatter, and a heavier tail would dominate the result.
+- structure, and second-order terms and fields of single exposures: half-t with `STRUCTURE_DOF`
+  degrees of freedom, nearly flat in the logarithm from the median up to the error of a star (at
+  which that of structure ends).  The data dominate as soon as stars show structure.
+- scatter of linear terms of exposures, curvature of drifts, errors of catalogue stars: half-Cauchy.
+  Two or three exposures hardly constrain a scatter, and a heavier tail would dominate the result.
 
 The scale is given by the median.
 """
