@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.data.covariances import covariances_of
-from bayesdist.data.tables.checks import COMPLETED, check_columns, columns_of
+from bayesdist.data.tables.checks import COMPLETED, check_columns, columns_of, refuse_half
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Float, Int
 
@@ -38,7 +38,8 @@ class Detections:
     epoch : ndarray, shape (E,), optional
         Decimal year of each exposure.
     sigma : ndarray, optional
-        Standard error of x and of y, pixels; positive.
+        Standard error of x and of y, pixels; positive. The default is the rms of `sigma_x` and
+        `sigma_y`.
     mag : ndarray, optional
         Instrumental magnitudes, -2.5 log10(flux / exposure time).
     star : ndarray of int, optional
@@ -85,6 +86,10 @@ class Detections:
         if self.exposure_names is None:
             codes = range(int(np.max(self.exposure, initial=0)) + 1)
             object.__setattr__(self, "exposure_names", tuple(map(str, codes)))
+        refuse_half(_ELLIPSE[:2], columns_of(self, _ELLIPSE), where=self.where, what="errors")
+        if self.sigma is None and self.sigma_x is not None and self.sigma_y is not None:
+            rms = np.sqrt((np.square(self.sigma_x) + np.square(self.sigma_y)) / 2)
+            object.__setattr__(self, "sigma", rms)
         if n == 0:
             raise InputError("holds no detections", where=self.where, do="give a list with stars")
         check_columns(
@@ -158,16 +163,26 @@ def detections_of(
 ) -> Detections:
     """Combine lists of one exposure each; `epoch` (E,) is in decimal years.
 
-    `sigma` is an error in pixels common to all detections. Without it, errors are those of the
-    lists if all lists have errors. Raises InputError if only some of the lists have magnitudes.
+    `sigma` is an error in pixels common to all detections. Without it, errors, and the covariances
+    of x and y, are those of the lists if all lists have them. Raises InputError if only some of the
+    lists have magnitudes.
     """
     with_mag = [stars.mag is not None for stars in lists]
     if any(with_mag) and not all(with_mag):
         bare = lists[with_mag.index(False)]
         raise InputError("has no magnitudes, and others have", where=bare.source)
     n = [len(stars) for stars in lists]
-    list_sigmas = [stars.sigma for stars in lists if stars.sigma is not None]
-    errors = np.concatenate(list_sigmas) if len(list_sigmas) == len(lists) else None
+    errors: dict[str, Any] = {}
+    if sigma is not None:
+        errors = {"sigma": np.full(sum(n), sigma)}
+    else:
+        columns = [columns_of(stars, ("sigma", *_ELLIPSE[:2])) for stars in lists]
+        names = set.intersection(*(set(of_list) for of_list in columns))
+        errors = {name: np.concatenate([c[name] for c in columns]) for name in names}
+        if "sigma_x" in names and any(stars.rho_xy is not None for stars in lists):
+            errors["rho_xy"] = np.concatenate(
+                [np.zeros(len(s)) if s.rho_xy is None else s.rho_xy for s in lists]
+            )
     return Detections(
         np.concatenate([stars.x for stars in lists]),
         np.concatenate([stars.y for stars in lists]),
@@ -175,9 +190,9 @@ def detections_of(
         tuple(stars.name for stars in lists),
         np.concatenate([stars.chip for stars in lists]),
         epoch,
-        errors if sigma is None else np.full(sum(n), sigma),
-        np.concatenate([stars.mag for stars in lists if stars.mag is not None])
+        mag=np.concatenate([stars.mag for stars in lists if stars.mag is not None])
         if all(with_mag)
         else None,
         source=lists[0].source if len(lists) == 1 else f"{len(lists)} star lists",
+        **errors,
     )

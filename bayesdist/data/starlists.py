@@ -218,7 +218,6 @@ def _of_table(
     if errors:
         covariance = pixel_covariances(Quantities(table, column_names, source))
         sigma, correlations = without_sizes(covariance)
-        values["sigma"] = np.sqrt((sigma**2).mean(axis=1))
         values["sigma_x"], values["sigma_y"] = sigma.T
         if "rho_xy" in column_names:
             values["rho_xy"] = correlations[:, 0, 1]
@@ -235,7 +234,6 @@ def _of_table(
         chip=column("chip").integers() if "chip" in column_names else COMPLETED,
         mag=values.get("mag"),
         q=values.get("q"),
-        sigma=values.get("sigma"),
         sigma_x=values.get("sigma_x"),
         sigma_y=values.get("sigma_y"),
         rho_xy=values.get("rho_xy"),

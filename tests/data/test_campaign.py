@@ -121,7 +121,11 @@ def test_matches_have_the_covariances_of_catalogue_and_centroids(rng, mirrored):
         np.testing.assert_allclose(found, expected, atol=3e-3 * np.abs(expected).max())
     # some lists alone have errors: those of the centroids are left out
     some = match_campaign(
-        [replace(lists[0], sigma_x=None), *lists[1:]], log, catalog, start, mirrored=(mirrored,)
+        [replace(lists[0], sigma_x=None, sigma_y=None, rho_xy=None), *lists[1:]],
+        log,
+        catalog,
+        start,
+        mirrored=(mirrored,),
     ).table
     first = some.select(some.exposure == 1)
     dt = log["e1"].epoch - 2004.5

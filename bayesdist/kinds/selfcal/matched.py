@@ -64,7 +64,7 @@ def matches_of(
     chip = np.zeros(len(rows), np.int64)
     for code, number in enumerate(numbers[1:], start=1):
         chip[d.chip[rows] == number] = code
-    return Matches.of_distinct_rows(
+    matches = Matches.of_distinct_rows(
         x=d.x[rows],
         y=d.y[rows],
         u=places[:, 0],
@@ -83,6 +83,10 @@ def matches_of(
         n_rows=inputs.n_read,
         rejected={**inputs.rejected, **unused},
     )
+    if p.shape is None:
+        return matches
+    W = p.W[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
+    return matches.with_covariances(p.var[:, None, None] * np.linalg.inv(W))
 
 
 def _axes(W: Float) -> Float:

@@ -303,6 +303,9 @@ def _sample(
     r = (p.places(theta) - p.star_places(some.stars))[..., None]
     residual = np.linalg.solve(J, r)[:, :, 0] * pixel
     variance = (p.var + solution.mixture.jitter**2) * pixel**2
+    covariances = variance[:, None, None] * (
+        np.eye(2) if p.shape is None else np.linalg.inv(p.shape)
+    )
     leverage = taken_by_stars(solution)[rows]
     at_rows = {name: None if column is None else column[rows] for name, column in known.items()}
     frames = [model.frame(theta, e) for e in range(len(model.exposures))]
@@ -314,7 +317,8 @@ def _sample(
         score=g.T,
         curvature=np.stack([H[:, 0, 0], H[:, 0, 1], H[:, 1, 1]]),
         residual=np.asarray(residual.T, float),
-        variance=np.stack([variance, variance]),
+        variance=np.stack([covariances[:, 0, 0], covariances[:, 1, 1]]),
+        covariance=None if p.shape is None else covariances[:, 0, 1],
         inlier=memberships(problem, theta, solution.mixture, solution.stars)[rows],
         mag=at_rows["mag"],
         colour=at_rows["colour"],

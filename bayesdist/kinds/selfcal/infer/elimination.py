@@ -357,7 +357,9 @@ class StarPiece:
 
     def __sizeof__(self) -> int:
         """Size of all columns in bytes, which Dask uses to estimate the cost of moving a piece."""
-        columns = (*self.problem.columns, self.problem.seen, self.stars)
+        columns = [*self.problem.columns, self.problem.seen, self.stars]
+        if self.problem.shape is not None:
+            columns.append(self.problem.shape)
         return sum(column.nbytes for column in columns)
 
     def split(self, detections: int) -> Iterator[StarPiece]:

@@ -219,7 +219,8 @@ def _in_unit(posterior: Posterior, pixel: float) -> Posterior:
 def _fingerprint(solution: SelfCalibrationMode, *settings: object) -> str:
     """Hash of the data, model and settings, which a resumed run must share."""
     p, digest = solution.problem, hashlib.sha256()
-    for column in (p.seen, p.var, p.starts, p.groups.index, solution.theta):
+    shape = () if p.shape is None else (p.shape,)
+    for column in (p.seen, p.var, *shape, p.starts, p.groups.index, solution.theta):
         digest.update(np.ascontiguousarray(column).data)
     digest.update(repr((p.model.to_dict(), settings)).encode())
     return digest.hexdigest()

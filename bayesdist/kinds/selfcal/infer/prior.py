@@ -182,6 +182,9 @@ class ReferenceStars:
         none = StarPriors.none(problem.n_stars, problem.n_star)
         centre, precision = none.centre.copy(), none.precision.copy()
         moving = problem.n_star >= 4 and catalog.pm_u is not None and catalog.sigma_pm_u is not None
+        if catalog.correlations is not None:
+            self._add_correlated(centre, precision, rows, catalog, matched, moving=moving)
+            return replace(none, centre=centre, precision=precision)
         for axis, name in enumerate("uv"):
             sigma = getattr(catalog, f"sigma_{name}")[matched]
             centre[rows, axis] = getattr(catalog, name)[matched]
@@ -203,6 +206,29 @@ class ReferenceStars:
             precision[rows, 2 + axis, axis] -= years * sigma**-2.0
             precision[rows, 2 + axis, 2 + axis] += motion**-2.0 + (years / sigma) ** 2
         return replace(none, centre=centre, precision=precision)
+
+    def _add_correlated(
+        self,
+        centre: Float,
+        precision: Float,
+        rows: Int,
+        catalog: ReferenceCatalog,
+        matched: Int,
+        *,
+        moving: bool,
+    ) -> None:
+        """Set means and add precisions of stars `rows`, which are `matched` in the catalogue.
+
+        `catalog` is the catalogue at the date of the stars' positions.
+        """
+        names = ("u", "v", "pm_u", "pm_v")[: 4 if moving else 2]
+        n = len(names)
+        centre[rows[:, None], np.arange(n)] = np.column_stack(
+            [getattr(catalog, name)[matched] for name in names]
+        )
+        which = np.array([0, 1, 3, 4])[:n]
+        covariances = catalog.covariances[matched[:, None, None], which[:, None], which]
+        precision[rows, :n, :n] += np.linalg.inv(covariances)
 
     def _pairs(self, problem: Problem, catalog: ReferenceCatalog, places: Float) -> tuple[Int, Int]:
         """Indices of the identified stars, and of their reference stars."""

@@ -62,9 +62,10 @@ class Problem:
     X: Float
     Y: Float
     offset: Float  # displacement (N, 2) on the sky from there to the detection
-    # elements uu, uv, vv (N, 3) of the matrix that converts sky residuals to squared pixels
+    # elements uu, uv, vv (N, 3) of the matrix that converts sky residuals to squared pixels or,
+    # with `shape`, to `var` times the chi-square of the quoted errors
     W: Float
-    var: Float  # squared quoted errors (N,) in square pixels
+    var: Float  # squared quoted errors (N,) in square pixels; with `shape` on the geometric mean
     time: Float  # years (N,) since `epoch0`; empty if stars have no proper motion
     factor: Float  # parallax factors (N, 2); empty without parallax
     priors: StarPriors
@@ -74,6 +75,9 @@ class Problem:
     epoch0: float = 0.0  # date of the stars' positions in decimal years
     # known scale (E,) of the sky in each exposure about the origin of the frames
     dilation: Float | None = None
+    # inverse covariances (N, 2, 2) of x and y times `var`, of determinant 1; None if errors are
+    # equal on both axes.  The jitter has the same shape.
+    shape: Float | None = None
 
     def __len__(self) -> int:
         return len(self.X)
@@ -255,7 +259,12 @@ class Problem:
                 half,
                 self.model.order,
             )
-        return replace(self, X=X, Y=Y, offset=offset, W=W)
+        out = replace(self, X=X, Y=Y, offset=offset, W=W)
+        if self.shape is None:
+            return out
+        back = np.linalg.inv(out.jacobians(theta, slice(0, len(X))))
+        matrix = np.swapaxes(back, 1, 2) @ self.shape @ back
+        return replace(out, W=matrix.reshape(-1, 4)[:, [0, 1, 3]])
 
     def of_stars(self, which: Int) -> Problem:
         """Problem with a subset of the stars, given by ascending indices `which`."""
@@ -276,6 +285,7 @@ class Problem:
             factor=self.factor[rows] if len(self.factor) else self.factor,
             priors=StarPriors(self.priors.centre[which], self.priors.precision[which]),
             rows=self.rows[rows],
+            shape=None if self.shape is None else self.shape[rows],
         )
 
 
@@ -366,6 +376,11 @@ def prepare(
             detections.x[rows[of_chip]], detections.y[rows[of_chip]]
         )
         X[of_chip], Y[of_chip] = scaled
+    var, shape = detections.sigma[rows] ** 2, None
+    covariances = detections.covariances
+    if covariances is not None:
+        var = np.sqrt(np.linalg.det(covariances[rows]))
+        shape = np.asarray(var[:, None, None] * np.linalg.inv(covariances[rows]), float)
     problem = Problem(
         model=model,
         groups=groups,
@@ -375,7 +390,7 @@ def prepare(
         Y=Y,
         offset=np.zeros((len(rows), 2)),
         W=np.empty((0, 3)),
-        var=detections.sigma[rows] ** 2,
+        var=var,
         time=time,
         factor=factor,
         priors=StarPriors.none(len(starts) - 1, q),
@@ -384,6 +399,7 @@ def prepare(
         pixel=np.nan,
         epoch0=epoch0,
         dilation=None if dilation is None else np.asarray(dilation, float),
+        shape=shape,
     )
     problem = problem.at(theta, problem.mean_places(theta))
     uu, uv, vv = problem.W.T

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from bayesdist.kinds.selfcal.infer.problem import prepare
@@ -34,6 +36,19 @@ def problem_of(simulated, model: DistortionModel | None = None, **more):
     for _ in range(3):
         found = found.at(simulated.theta, stars)
     return found, stars
+
+
+def with_ellipses(simulated, seed: int, *, rho: float | None = None):
+    """A field simulated without errors, with errors of all shapes, or all correlated by `rho`."""
+    rng = np.random.default_rng([46, seed])
+    d = simulated.detections
+    n = len(d)
+    sigma = 0.02 * np.exp(0.4 * rng.standard_normal((2, n)))
+    correlation = rng.uniform(-0.95, 0.95, n) if rho is None else np.full(n, rho)
+    detections = replace(d, sigma=None, sigma_x=sigma[0], sigma_y=sigma[1], rho_xy=correlation)
+    noise = np.linalg.cholesky(detections.covariances) @ rng.standard_normal((n, 2, 1))
+    x, y = np.stack([d.x, d.y]) + noise[:, :, 0].T
+    return replace(simulated, detections=replace(detections, x=x, y=y))
 
 
 def aligned(theta, truth, gauge):

@@ -7,7 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 from scipy.special import logsumexp
+from scipy.stats import multivariate_normal
 
 from bayesdist.kinds.selfcal import kernel
 from bayesdist.kinds.selfcal.infer import elimination
@@ -15,14 +17,18 @@ from bayesdist.kinds.selfcal.infer.elimination import Mixture, StarModes, expand
 from bayesdist.kinds.selfcal.infer.problem import Problem
 from bayesdist.kinds.selfcal.patterns.exposures import pixels_of
 from bayesdist.model import TimeDependence
-from tests.kinds.selfcal.infer.fields import field, problem_of
+from tests.kinds.selfcal.infer.fields import field, problem_of, with_ellipses
 from tests.reduced import case_in_full
 
 NO_FALSE = Mixture(0.0, 1e-300)
 
 
-def _dense(problem: Problem, theta):
-    """Normal matrix of the distortion, from the full design of distortion and stars."""
+def _dense(problem: Problem, theta, covariances=None):
+    """Normal matrix of the distortion, from the full design of distortion and stars.
+
+    If `covariances` (N, 2, 2) of the pixels are given, the weights are made from them and from
+    differences of predictions.
+    """
     p, model = problem, problem.model
     exposure = p.groups.exposure[p.groups.index]
     chip = np.array([c.number for c in model.chips])[p.groups.chip[p.groups.index]]
@@ -34,6 +40,18 @@ def _dense(problem: Problem, theta):
     epoch = p.groups.epoch[p.groups.index] if model.time is not None else None
     J = model.jacobian(theta, x, y, exposure=exposure, chip=chip, epoch=epoch)
     H = p.W[:, [0, 1, 1, 2]].reshape(-1, 2, 2) / p.var[:, None, None]
+    if covariances is not None:
+        which = {"exposure": exposure, "chip": chip, "epoch": epoch}
+        by = [
+            (
+                model.predict(theta, x + a, y + b, **which)
+                - model.predict(theta, x - a, y - b, **which)
+            )
+            / 2
+            for a, b in ((1, 0), (0, 1))
+        ]
+        pixel = np.stack(by, axis=-1)
+        H = np.linalg.inv(pixel @ covariances @ np.swapaxes(pixel, 1, 2))
     S = np.zeros((len(p), 2, p.n_star))
     S[:, 0, 0] = S[:, 1, 1] = 1.0
     if p.n_star >= 4:
@@ -77,6 +95,48 @@ def test_elimination_is_the_schur_complement(kind, motion):
     found, _ = expand(problem, theta, NO_FALSE, stars)
     dense = _dense(problem, theta)
     assert np.abs(found.curvature - dense).max() < 1e-9 * np.abs(dense).max()
+
+
+def test_covariances_of_detections_weigh_distortion_and_stars():
+    """Errors of all shapes: the weights are those of numpy, and stars are at weighted means."""
+    simulated = with_ellipses(field(3, 8, 150, n_chips=2, sigma=1e-9), 3)
+    theta = simulated.theta
+    problem, stars = problem_of(simulated)
+    covariances = simulated.detections.covariances[problem.rows]
+    found, modes = expand(problem, theta, NO_FALSE, stars)
+    dense = _dense(problem, theta, covariances)
+    # pixels are not quite parallelograms over the step of the differences
+    assert np.abs(found.curvature - dense).max() < 1e-5 * np.abs(dense).max()
+    # quoted errors without their correlations would be wrong by much more
+    bare = covariances * np.eye(2)
+    assert np.abs(found.curvature - _dense(problem, theta, bare)).max() > 0.1 * dense.max()
+    H = problem.W[:, [0, 1, 1, 2]].reshape(-1, 2, 2) / problem.var[:, None, None]
+    z = problem.places(theta)
+    sums = [np.add.reduceat(v, problem.starts[:-1]) for v in (H, np.einsum("nab,nb->na", H, z))]
+    mean = np.linalg.solve(sums[0], sums[1][..., None])[..., 0]
+    np.testing.assert_allclose(modes, mean, atol=1e-6)
+
+
+def test_the_density_is_that_of_bivariate_normals():
+    """Integrated over the stars, in closed form, with differences between parameters."""
+    simulated = with_ellipses(field(4, 5, 40, order=2, sigma=1e-9), 4)
+    theta, rng = simulated.theta, np.random.default_rng(4)
+    problem, stars = problem_of(simulated)
+    C = simulated.detections.covariances[problem.rows]
+    modes = StarModes.at(problem, theta, NO_FALSE, expand(problem, theta, NO_FALSE, stars)[1])
+    tried = theta + 1e-4 * rng.standard_normal((3, len(theta)))
+    found = log_marginal(problem, tried, np.tile([0.0, 1e-300], (3, 1)), modes)
+    J = problem.jacobians(theta, slice(0, len(problem)))
+    on_sky = J @ C @ np.swapaxes(J, 1, 2)
+    expected = []
+    for one in tried:
+        z, total = problem.places(one), 0.0
+        for a, b in zip(problem.starts[:-1], problem.starts[1:], strict=True):
+            # a prior of one pixel, 50 times the errors, of the place of the star
+            cov = block_diag(*on_sky[a:b]) + np.kron(np.ones((b - a, b - a)), np.eye(2))
+            total += multivariate_normal.logpdf((z[a:b] - z[a:b].mean(axis=0)).ravel(), cov=cov)
+        expected.append(total)
+    np.testing.assert_allclose(np.diff(found), np.diff(expected), rtol=1e-3, atol=1e-2)
 
 
 def test_few_matrices_of_all_parameters_are_in_memory_at_a_time(monkeypatch):

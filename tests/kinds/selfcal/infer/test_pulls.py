@@ -7,14 +7,19 @@ import pytest
 from scipy import stats
 
 from bayesdist.kinds.selfcal.infer import self_calibrate, star_catalogue
-from tests.kinds.selfcal.infer.fields import aligned, field
+from tests.kinds.selfcal.infer.fields import aligned, field, with_ellipses
 
 pytestmark = pytest.mark.slow
 
 
-def _one(seed, n_exposures, n_stars, rolls):
+def _one(seed, n_exposures, n_stars, rolls, *, tilted=False):
     """Chi-square of the coefficients and frames, and normalised errors of the stars."""
-    simulated = field(seed, n_exposures, n_stars, rolls=rolls, disturbed=0.025, spurious=0.025)
+    if tilted:
+        simulated = with_ellipses(
+            field(seed, n_exposures, n_stars, rolls=rolls, sigma=1e-9), seed, rho=0.9
+        )
+    else:
+        simulated = field(seed, n_exposures, n_stars, rolls=rolls, disturbed=0.025, spurious=0.025)
     K, truth = simulated.model.n_terms, simulated.theta
     start = truth.copy()
     start[3:K] *= 0.9
@@ -53,12 +58,16 @@ def _stars(simulated, found):
     return (off / sigma).ravel()
 
 
-@pytest.mark.parametrize("rolls", [(0, 60, 130), (0, 0, 0)], ids=["three rolls", "one roll"])
-def test_pulls(rolls, full, capsys):
+@pytest.mark.parametrize(
+    ("rolls", "tilted"),
+    [((0, 60, 130), False), ((0, 0, 0), False), ((0, 60, 130), True)],
+    ids=["three rolls", "one roll", "ellipses"],
+)
+def test_pulls(rolls, tilted, full, capsys):
     seeds, size = (range(20), (40, 20_000)) if full else (range(6), (12, 1200))
     chi2, dof, pulls, star_pulls = [], [], [], []
     for seed in seeds:
-        one, p, of_stars = _one(100 + seed, *size, rolls)
+        one, p, of_stars = _one(100 + seed, *size, rolls, tilted=tilted)
         chi2.append(one)
         dof.append(len(p))
         pulls.append(p)
@@ -67,7 +76,8 @@ def test_pulls(rolls, full, capsys):
         z = np.concatenate(pulls)
         w = np.concatenate(star_pulls)
         print(
-            f"\nself-calibration, {len(chi2)} fields, rolls {rolls}: coefficients and frames rms "
+            f"\nself-calibration, {len(chi2)} fields, rolls {rolls}"
+            f"{', ellipses' * tilted}: coefficients and frames rms "
             f"{np.sqrt((z**2).mean()):.3f}, chi-square {sum(chi2):.0f} of {sum(dof)}; stars "
             f"{np.mean(np.abs(w) < 1):.3f} within one sigma, {np.mean(np.abs(w) < 2):.3f} in two"
         )
