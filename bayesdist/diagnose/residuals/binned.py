@@ -88,12 +88,18 @@ class BinnedSums:
     second: Float
     # number of stars outside of the detector, which are in no bin
     n_outside: int = 0
+    # (ny, nx) sums of the products of u and v; None if the errors of both are not correlated
+    mixed: Float | None = None
 
     def __add__(self, other: BinnedSums) -> BinnedSums:
         if self.size != other.size or self.count.shape != other.count.shape:
             raise ValueError("sums over different bins do not add")
         names = ("count", "first", "second", "n_outside")
-        return BinnedSums(self.size, *(getattr(self, n) + getattr(other, n) for n in names))
+        mixed = None
+        if self.mixed is not None and other.mixed is not None:
+            mixed = self.mixed + other.mixed
+        sums = (getattr(self, n) + getattr(other, n) for n in names)
+        return BinnedSums(self.size, *sums, mixed=mixed)
 
     @property
     def n(self) -> int:
@@ -110,6 +116,19 @@ class BinnedSums:
         # rounding may make a zero scatter slightly negative
         variance = _ratio(np.maximum(spread, 0.0), count**2)
         return mean, np.sqrt(variance * _ratio(count, count - 1.0))
+
+    @property
+    def covariance(self) -> Float | None:
+        """Covariance (ny, nx) of the means of u and v from the scatter in the bins.
+
+        None without `mixed`.
+        """
+        if self.mixed is None:
+            return None
+        count = self.count.astype(np.float64)
+        mean = np.nan_to_num(_ratio(self.first, count))
+        spread = self.mixed - mean[0] * mean[1] * count
+        return np.asarray(_ratio(_ratio(spread, count), count - 1.0))
 
     def residuals(self) -> BinnedResiduals:
         """Means of u and v, with their standard errors and the centres of the bins."""
@@ -159,6 +178,7 @@ def binned_sums(
     *more: ArrayLike,
     bins: int | tuple[int, int],
     size: tuple[float, float],
+    mixed: bool = False,
 ) -> BinnedSums:
     """Sums of residuals in bins of the detector.
 
@@ -174,6 +194,8 @@ def binned_sums(
         Number of bins in x and y.
     size : tuple of float
         Numbers of columns and rows of the detector; the bins extend from 0.5 to size + 0.5.
+    mixed : bool, optional
+        True to sum the products of both residuals as well.
 
     Returns
     -------
@@ -196,7 +218,8 @@ def binned_sums(
         block = [a[start : start + _BLOCK] for a in columns]
         if not all(np.isfinite(a).all() for a in block):
             raise InputError("a position or residual is not finite", do="leave that star out")
-        return _block_sums(block, int(nx), int(ny), (float(size[0]), float(size[1])))
+        sizes = float(size[0]), float(size[1])
+        return _block_sums(block, int(nx), int(ny), sizes, mixed=mixed)
 
     out = sums_from(0)
     for start in range(_BLOCK, len(columns[0]), _BLOCK):
@@ -204,7 +227,9 @@ def binned_sums(
     return out
 
 
-def _block_sums(block: Sequence[Float], nx: int, ny: int, size: tuple[float, float]) -> BinnedSums:
+def _block_sums(
+    block: Sequence[Float], nx: int, ny: int, size: tuple[float, float], *, mixed: bool
+) -> BinnedSums:
     """Sums over the stars of a block."""
     x, y, *residuals = block
     edges_x, edges_y = _edges(size[0], nx), _edges(size[1], ny)
@@ -218,7 +243,8 @@ def _block_sums(block: Sequence[Float], nx: int, ny: int, size: tuple[float, flo
         return np.bincount(index, values, minlength=nx * ny).reshape(ny, nx)
 
     first, second = (np.stack([total(r**k) for r in residuals]) for k in (1, 2))
-    return BinnedSums(size, total().astype(np.int64), first, second, n_outside)
+    products = total(residuals[0] * residuals[1]) if mixed else None
+    return BinnedSums(size, total().astype(np.int64), first, second, n_outside, products)
 
 
 def band_bins(

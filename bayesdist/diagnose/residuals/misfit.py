@@ -107,7 +107,8 @@ def misfit_of(sums: Mapping[str, BinnedSums], *, order: int | None = None, unit:
     """
     misfits = []
     for name, partition_sums in sums.items():
-        p, structure = _test(partition_sums.residuals(), _absorbed(partition_sums, order))
+        absorbed = _absorbed(partition_sums, order)
+        p, structure = _test(partition_sums.residuals(), absorbed, partition_sums.covariance)
         misfits.append(Misfit(p, name, structure, unit))
     return worst_misfit(misfits)
 
@@ -144,7 +145,11 @@ def bin_means(n: int, order: int) -> Float:
     return np.asarray(np.diff(integrals, axis=1) * n / 2)
 
 
-def _test(cells: BinnedResiduals, absorbed: float) -> tuple[float, float]:
+def _test(cells: BinnedResiduals, absorbed: float, covariance: Float | None) -> tuple[float, float]:
+    """P-value of the mean residuals, and the rms of the structure.
+
+    `covariance` (ny, nx) is that of the means of u and v if their errors are correlated.
+    """
     good = cells.count >= 5
     n = cells.count[good]
     # the square of a t variable is larger than that of a normal variable
@@ -153,6 +158,12 @@ def _test(cells: BinnedResiduals, absorbed: float) -> tuple[float, float]:
     sem = np.stack([cells.sem_u[good], cells.sem_v[good]]) / shrink
     sem = np.maximum(sem, np.finfo(float).tiny ** 0.25)  # residuals may be equal to the last bit
     total = float(((mean / sem) ** 2).sum())
+    if covariance is not None:
+        # Hotelling's square of a bin, whose mean is (n - 1) / (n - 4) times that of a chi-square
+        mixed = covariance[good]
+        (u, v), (uu, vv) = mean, (shrink * sem) ** 2
+        square = (vv * u**2 - 2 * mixed * u * v + uu * v**2) / (uu * vv - mixed**2)
+        total = float((square * (n - 4) / (n - 1)).sum())
     dof = max(mean.size - absorbed * n.size / cells.count.size, 1.0)
     p = float(chi2_sf(total, dof))
     excess = (mean**2 - sem**2).sum(axis=0).mean() if n.size else 0.0

@@ -245,7 +245,9 @@ def star_sums(
         chip_arrays = arrays if good.all() else tuple(a[good] for a in arrays)
         size = stars.model.chips[k].size
         for bins in several:
-            binned[number, bins] = binned_sums(*chip_arrays, bins=bins, size=size)
+            binned[number, bins] = binned_sums(
+                *chip_arrays, bins=bins, size=size, mixed=stars.is_correlated
+            )
     return StarSums(binned, exposures)
 
 
@@ -276,7 +278,9 @@ def star_bins(
             cell = cell_index(X, Y, (nx, ny))
             _, of = joint_clusters(cell, star)
             means = [np.bincount(of, z) / np.bincount(of) for z in chip_values]
-            out[number, (nx, ny)] = binned_sums(*means, bins=(nx, ny), size=size)
+            out[number, (nx, ny)] = binned_sums(
+                *means, bins=(nx, ny), size=size, mixed=stars.is_correlated
+            )
     return out
 
 

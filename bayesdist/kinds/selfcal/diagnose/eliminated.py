@@ -458,11 +458,21 @@ class StarBlock:
     rows: slice  # range of detections in the problem
     star: Int  # (n,) index of each detection's star in the block
     member: Float  # (n,) probability of belonging to the star
-    weight: Float  # (n,) inverse variance per axis, times that probability
+    # (n,) inverse variance per axis or, with `shape`, on the geometric mean, times that probability
+    weight: Float
     residual: Float  # (n, 2) detection minus star
     # (n, q, 2) R B: B is the curvature of the log density with respect to the star's parameters and
     # the detection's pixels, R^T R the inverse of that with respect to the star's parameters
     ties: Float
+    shape: Float | None = (
+        None  # (n, 2, 2) weights over `weight`; None if they are equal on both axes
+    )
+
+    def weighted(self, values: Float) -> Float:
+        """Products (n, 2) of the weights of the detections with values (n, 2)."""
+        if self.shape is not None:
+            values = np.einsum("nab,nb->na", self.shape, values)
+        return self.weight[:, None] * values
 
 
 def star_blocks(solution: SelfCalibrationMode) -> Iterator[StarBlock]:
@@ -477,19 +487,23 @@ def star_blocks(solution: SelfCalibrationMode) -> Iterator[StarBlock]:
         to_pixels = np.linalg.inv(p.jacobians(theta, rows))
         w, star = weights[rows], p.star[rows] - first
         by_star = np.swapaxes(to_pixels @ places_by_star(p, rows), 1, 2)
-        curvature = w[:, None, None] * by_star @ np.swapaxes(by_star, 1, 2)
+        shape = None if p.shape is None else p.shape[rows]
+        pulled = w[:, None, None] * (by_star if shape is None else by_star @ shape)
+        curvature = pulled @ np.swapaxes(by_star, 1, 2)
         information = p.priors.precision[first:last] + sums_over(star, curvature, last - first)
         roots = inverse_roots(information)
         residual = np.einsum("nij,nj->ni", to_pixels, residuals[rows])
-        ties = w[:, None, None] * (roots[star] @ by_star)
-        yield StarBlock(rows, star, members[rows], w, residual, ties)
+        ties = roots[star] @ pulled
+        yield StarBlock(rows, star, members[rows], w, residual, ties, shape)
 
 
 def taken_by_stars(solution: SelfCalibrationMode) -> Float:
     """Fraction (N,) of each detection's variance that its star absorbs, at most `MOST_TAKEN`."""
     out = np.empty(len(solution.problem))
     for block in star_blocks(solution):
-        square = np.sum(block.ties**2, axis=(1, 2))
+        ties = block.ties
+        by_weight = ties if block.shape is None else ties @ np.linalg.inv(block.shape)
+        square = np.sum(ties * by_weight, axis=(1, 2))
         out[block.rows] = square / (2 * np.maximum(block.weight, np.finfo(float).tiny))
     return np.minimum(out, MOST_TAKEN)
 

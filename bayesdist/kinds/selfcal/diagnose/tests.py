@@ -418,9 +418,16 @@ def _add(sums: _Shifts, some: StarBlock, cell: Int) -> None:
     """Add a block of stars; the curvature changes by the part that they absorb."""
     w, ties, n = some.weight, some.ties, len(sums.weight)
     index = np.stack([cell, cell + n // 2], axis=1)
-    pull = w[:, None] * some.residual
+    pull = some.weighted(some.residual)
     sums.gradient[:] += np.bincount(index.ravel(), pull.ravel(), minlength=n)
-    sums.weight[:] += np.bincount(index.ravel(), np.repeat(w, 2), minlength=n)
+    weights = np.repeat(w, 2)
+    if some.shape is not None:
+        weights = weights * np.einsum("naa->na", some.shape).ravel()
+        mixed = np.bincount(cell, w * some.shape[:, 0, 1], minlength=n // 2)
+        k = np.arange(n // 2)
+        sums.curvature[k, k + n // 2] += mixed
+        sums.curvature[k + n // 2, k] += mixed
+    sums.weight[:] += np.bincount(index.ravel(), weights, minlength=n)
     q = ties.shape[1]
     row = (some.star * q)[:, None, None] + np.arange(q)[:, None]
     at = np.broadcast_arrays(row, index[:, None, :])
