@@ -94,12 +94,17 @@ class BinnedSums:
     def __add__(self, other: BinnedSums) -> BinnedSums:
         if self.size != other.size or self.count.shape != other.count.shape:
             raise ValueError("sums over different bins do not add")
-        names = ("count", "first", "second", "n_outside")
         mixed = None
         if self.mixed is not None and other.mixed is not None:
             mixed = self.mixed + other.mixed
-        sums = (getattr(self, n) + getattr(other, n) for n in names)
-        return BinnedSums(self.size, *sums, mixed=mixed)
+        return BinnedSums(
+            self.size,
+            self.count + other.count,
+            self.first + other.first,
+            self.second + other.second,
+            self.n_outside + other.n_outside,
+            mixed,
+        )
 
     @property
     def n(self) -> int:

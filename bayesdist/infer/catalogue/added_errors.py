@@ -21,6 +21,10 @@ detections of a star taken together, so that neither long tails nor stars with m
 groups that do not exist.  The second term prevents small groups from being split off.  If there are
 many groups, their errors are shrunk towards the common error, as far as their differences may be
 noise (empirical Bayes), since the results are used as if they were exact.
+
+Errors that are correlated between u and v enter by their variances alone, so that the estimates
+remain consistent.  What the squares of both axes have in common is in the stated error of an error
+for both axes, by its own dispersion.
 """
 
 from __future__ import annotations
@@ -191,6 +195,8 @@ def grouped_errors(
     spread = np.ptp(states[best].variance) / typical
     if evidence[best] < DECISIVE or np.sqrt(1.0 + spread) < 1.0 + MATERIAL:
         best = ONE
+    if table.rho_uv is not None:
+        dispersion = _dispersion(table, states[best], quoted, codes[best])
     return _result(best, by, labels, states[best], quoted, codes[best], evidence, dispersion)
 
 

@@ -277,6 +277,10 @@ def _with_memberships(matches: Matches, mixture: ResidualMixture, jitter: Float)
     sigma_u, sigma_v = matches.column("sigma_u"), matches.column("sigma_v")
     likely = mixture.probability >= LIKELY
     p = np.maximum(mixture.probability, LIKELY)
+    if matches.rho_uv is not None:
+        covariances = matches.covariances() + jitter[:, None, None] ** 2 * np.eye(2)
+        wide = matches.with_covariances(covariances / p[:, None, None])
+        return wide.select(likely, reason="false match")
     wide = matches.with_errors(
         (
             np.sqrt((sigma_u**2 + jitter**2) / p),

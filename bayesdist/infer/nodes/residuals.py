@@ -43,8 +43,8 @@ class PixelShifts:
     shift : ndarray, shape (N, 2)
         Corrections to be added to x and y, in pixels.
     variance : ndarray, shape (N, 2)
-        Variances of the shifts from the quoted errors, in square pixels. The correlation of a few
-        per cent between x and y that a skewed polynomial causes is neglected.
+        Variances of the shifts from the quoted errors, in square pixels. Correlations between x and
+        y are not needed: tables of both are fitted separately.
     """
 
     shift: Float
@@ -91,10 +91,12 @@ def pixel_shifts(solution: Solution, matches: Matches) -> PixelShifts:
     inverse[:, 0, 0], inverse[:, 1, 1] = J[:, 1, 1] / det, J[:, 0, 0] / det
     inverse[:, 0, 1], inverse[:, 1, 0] = -J[:, 0, 1] / det, -J[:, 1, 0] / det
     residual = np.stack([matches.u, matches.v], axis=1) - fitted
+    shift = np.einsum("nab,nb->na", inverse, residual)
+    if matches.rho_uv is not None:
+        covariances = inverse @ matches.covariances() @ np.swapaxes(inverse, 1, 2)
+        return PixelShifts(shift, np.einsum("naa->na", covariances))
     variance = np.stack([sigma_u, sigma_v], axis=1) ** 2
-    return PixelShifts(
-        np.einsum("nab,nb->na", inverse, residual), np.einsum("nab,nb->na", inverse**2, variance)
-    )
+    return PixelShifts(shift, np.einsum("nab,nb->na", inverse**2, variance))
 
 
 def corrected_matches(tables: Sequence[LookupTable], matches: Matches) -> Matches:

@@ -121,6 +121,26 @@ def test_stated_errors_are_those_by_which_estimates_scatter():
     assert (pulls**2).mean() == pytest.approx(1.0, abs=4 * np.sqrt(2 / pulls.size))
 
 
+def test_correlated_errors_neither_split_the_axes_nor_bias_what_is_added():
+    """Variances alone are used: what is lost is in the dispersion, and so in the stated error."""
+    pulls, dispersions = [], []
+    for seed in range(25):
+        rng = np.random.default_rng([46, seed])
+        base = stars(seed, 400, (0.0, 0.0), false=0.0)
+        sigma = rng.uniform(0.02, 0.06, 400)
+        C = sigma[:, None, None] ** 2 * np.array([[1.0, 0.95], [0.95, 1.0]])
+        noise = np.einsum("nij,nj->ni", np.linalg.cholesky(C), rng.standard_normal((400, 2)))
+        noise += 0.03 * rng.standard_normal((400, 2))
+        table = base.with_columns(u=base.u + noise[:, 0], v=base.v + noise[:, 1])
+        found = found_in(table.with_covariances(C))
+        assert found.grouping == "one"
+        pulls.append((found.variance[0, 0] - 0.03**2) / found.error[0, 0])
+        dispersions.append(found.dispersion)
+    assert np.mean(dispersions) > 1.1
+    assert abs(np.mean(pulls)) < 4 / np.sqrt(25)
+    assert np.mean(np.square(pulls)) == pytest.approx(1.0, abs=4 * np.sqrt(2 / 25))
+
+
 @pytest.mark.parametrize(
     ("dof", "n"),
     [

@@ -69,6 +69,17 @@ def test_jacobian_is_the_slope_of_predict(turned):
         np.testing.assert_allclose(got[k], want, rtol=1e-7, atol=1e-9)
 
 
+def test_variances_of_turned_ellipses_are_those_of_the_pixels(turned, rng):
+    """Errors along x and y, which are correlated between u and v where exposures are turned."""
+    model, theta, matches = turned
+    sigma = rng.uniform(0.01, 0.1, (len(matches), 2))
+    J = model.slopes(theta, matches.x, matches.y, **columns_of(matches))
+    matches = matches.with_covariances(J * sigma[:, None] ** 2 @ np.swapaxes(J, 1, 2))
+    assert np.abs(matches.rho_uv).max() > 0.9
+    found = pixel_shifts(Solution(model, theta), matches)
+    np.testing.assert_allclose(found.variance, sigma**2, rtol=1e-9)
+
+
 def test_adding_the_shift_meets_the_position(turned, rng):
     """A star whose pixel is off by 0.1 px: the shift leads back, whatever chip, roll and epoch."""
     model, theta, matches = turned
