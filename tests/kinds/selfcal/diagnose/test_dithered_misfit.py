@@ -11,7 +11,7 @@ from bayesdist.kinds.selfcal.diagnose.tests import _shifts, dithered_misfit
 from bayesdist.kinds.selfcal.infer import self_calibrate
 from bayesdist.kinds.selfcal.infer.elimination import memberships
 from tests.kinds.selfcal.dithered_fields import simulate_dithers, smooth_distortion
-from tests.kinds.selfcal.infer.fields import SIZE, chips, field
+from tests.kinds.selfcal.infer.fields import SIZE, chips, field, with_ellipses
 
 
 def _solved(simulated, detections=None):
@@ -49,6 +49,23 @@ def test_a_wave_on_the_second_chip_is_found_along_its_axis():
     assert found.significant and found.partition == "rows"
     # over both chips: half of the area has it
     assert abs(found.structure - 0.02 / np.sqrt(2)) < 0.002
+
+
+def test_errors_of_elongated_images_are_no_structure():
+    """Sums along both axes are nearly one; a wave on top is found with its size."""
+    p = []
+    for seed in range(4):
+        simulated = with_ellipses(field(seed, 8, 600, sigma=1e-9), seed, rho=0.95)
+        solved = _solved(simulated)
+        p.append(dithered_misfit(solved).p_value)
+        w = memberships(solved.problem, solved.theta, solved.mixture, solved.stars)
+        whole = np.bincount(solved.problem.star, w > 0.999) == solved.problem.counts
+        # the two numbers of a position are one in two of each detection's
+        taken = np.bincount(solved.problem.star, taken_by_stars(solved))[whole]
+        np.testing.assert_allclose(taken[solved.problem.counts[whole] > 2], 1.0, atol=0.02)
+    assert min(p) > 1e-3 / 4 and max(p) > 0.03
+    found = dithered_misfit(_solved(simulated, _waved(simulated.unlabelled, 0.02)))
+    assert found.significant and abs(found.structure - 0.02) < 0.004
 
 
 def test_what_small_dithers_hide_is_said():
