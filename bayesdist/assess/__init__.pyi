@@ -28,10 +28,8 @@ from .evaluation import (
     EvaluationSettings as EvaluationSettings,
     evaluate as evaluate,
 )
-from .requirements.margins import (
-    Margin as Margin,
-    Requirement as Requirement,
-)
+from .requirements.margins import Margin as Margin
+from .requirements.requirement import Requirement as Requirement
 from .solution import chip_places as chip_places
 from .terms.given import (
     TERM_KINDS as TERM_KINDS,
@@ -40,7 +38,6 @@ from .terms.given import (
 from .terms.catalogue import Catalogue as Catalogue
 from .terms.correlated import LocalErrors as LocalErrors
 from .units import (
-    UNITS as UNITS,
     convert as convert,
     pixel_scale_of as pixel_scale_of,
 )

@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from bayesdist.assess.comparison.frame import turn_matrix
-from bayesdist.assess.solution import Place, Solution, place_of
+from bayesdist.assess.solution import Place, place_of
 from bayesdist.errors import InputError, require_known
+from bayesdist.infer.solution.solution import Solution
 from bayesdist.model import Chip
 from bayesdist.model.basis import point_blocks
 from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh, position_of_largest

@@ -129,7 +129,7 @@ def fitted_inverse(
 
 def fit_inverse(
     forward: Forward, reference_pixel: tuple[float, float], size: tuple[float, float], order: int
-) -> tuple[dict[tuple[int, int], float], dict[tuple[int, int], float]]:
+) -> tuple[Terms, Terms]:
     """Fit the inverse polynomials P and Q of a map from pixels (x, y) to (U, V).
 
     `forward` maps FITS 1-based pixels x, y (N,) to U, V (N,) in pixels.  `size` has the columns and
@@ -219,7 +219,7 @@ class _InverseFit:
         out[0] = 0.0
         return out
 
-    def terms(self, wanted: Float) -> tuple[dict, dict]:
+    def terms(self, wanted: Float) -> tuple[Terms, Terms]:
         """Fit polynomials to values (N, 2); coefficients by power for both columns."""
         fitted = np.asarray(np.linalg.lstsq(self.design, wanted, rcond=None)[0], float)
         powers = self.basis.terms

@@ -3,7 +3,8 @@ import itertools
 import astropy.units as u
 import pytest
 
-from bayesdist.assess import UNITS, convert, pixel_scale_of
+from bayesdist.assess import convert, pixel_scale_of
+from bayesdist.data.tables.column import UNITS
 from bayesdist.errors import InputError
 from bayesdist.infer.posterior.checks import pixel_doubt
 

@@ -120,7 +120,7 @@ def reasons_of(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     return out
 
 
-def margins_text(rows: list[dict]) -> str:
+def margins_text(rows: Sequence[Mapping[str, Any]]) -> str:
     """Table of margins for the terminal, with a column 'scope' if any requirement has one."""
     scopes = [requirement_of(r).scope for r in rows]
     shown = [

@@ -16,7 +16,8 @@ from bayesdist.assess.domain import (
     in_region,
     region_words,
 )
-from bayesdist.assess.units import UNITS, stated_unit
+from bayesdist.assess.units import stated_unit
+from bayesdist.data.tables.column import UNITS
 from bayesdist.diagnose.residuals.binned import Coverage
 from bayesdist.errors import InputError, require_known
 from bayesdist.model.grid import grid_pixels, mesh

@@ -23,8 +23,9 @@ from bayesdist.assess.terms.forms import (
     Row,
     SizedTerm,
 )
-from bayesdist.assess.units import UNITS, convert
+from bayesdist.assess.units import convert
 from bayesdist.data.magnitude_errors import MagnitudeErrors
+from bayesdist.data.tables.column import UNITS
 from bayesdist.errors import InputError, require_known
 from bayesdist.model import DistortionModel, PolynomialBasis
 from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh

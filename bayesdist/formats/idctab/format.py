@@ -61,7 +61,7 @@ def describe_idctab(tab: IdcTab) -> list[str]:
 def _first_rows(tab: IdcTab) -> list[int]:
     """Indices of the first row of each chip and direction."""
     names = [c for c in ("DETCHIP", "DIRECTION") if c in tab.columns]
-    first_rows: dict[tuple, int] = {}
+    first_rows: dict[tuple[object, ...], int] = {}
     for k, row in enumerate(tab.rows):
         first_rows.setdefault(tuple(row[c] for c in names), k)
     return list(first_rows.values())

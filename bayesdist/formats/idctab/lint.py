@@ -167,7 +167,7 @@ def _rounding(tab: IdcTab) -> float:
 
 
 def _repeated_rows(tab: IdcTab) -> Iterator[Finding]:
-    keys: dict[tuple, list[int]] = {}
+    keys: dict[tuple[str, ...], list[int]] = {}
     names = [c for c in ("DETCHIP", "DIRECTION", *FILTER_COLUMNS) if c in tab.columns]
     for k, row in enumerate(tab.rows):
         keys.setdefault(tuple(str(row[c]).strip() for c in names), []).append(k)

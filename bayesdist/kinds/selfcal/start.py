@@ -92,7 +92,7 @@ def started(
     return model, start_parameters(model, coefficients, frames, middles)
 
 
-def _lists(d: Detections, *, apart: bool) -> tuple[Int, Int, list]:
+def _lists(d: Detections, *, apart: bool) -> tuple[Int, Int, list[Int]]:
     """Exposure and chip of each list, and the rows of its detections."""
     lists = []
     for e in range(len(d.exposure_names)):

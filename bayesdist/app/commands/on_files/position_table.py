@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from astropy.table import MaskedColumn, Table
@@ -52,7 +53,7 @@ def origin_line(origin: float, reason: str) -> str:
 def add_positions(table: Table, at: Positions, names: tuple[str, str], where: str) -> None:
     """Add columns with positions and their errors and, for detector positions, the chip."""
     x, y = names
-    new: dict[str, NDArray] = {x: at.x, y: at.y}
+    new: dict[str, NDArray[Any]] = {x: at.x, y: at.y}
     if at.cov is not None:
         new |= {f"sigma_{x}": at.sigma_x, f"sigma_{y}": at.sigma_y}
         new[f"corr_{x}_{y}"] = at.correlation
