@@ -32,8 +32,9 @@ from bayesdist.assess.terms.given import (
     said_by_user,
     sizes_of,
 )
-from bayesdist.assess.units import UNITS, convert
+from bayesdist.assess.units import convert
 from bayesdist.data import Matches
+from bayesdist.data.tables.column import UNITS
 from bayesdist.errors import InputError, require_known
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.model import DistortionModel
