@@ -42,7 +42,7 @@ WHERE = "calibrate"  # used in messages in place of the name of the configuratio
 # keys of [data] that apply to reading a table
 READING = (
     *("columns", "unit", "pixel_origin", "tangent_point", "epoch", "catalogue_epoch"),
-    *("not_finite", "same_position"),
+    *("motion_prior", "not_finite", "same_position"),
 )
 
 # arguments that settings may replace if they have their default values

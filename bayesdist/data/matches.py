@@ -199,7 +199,8 @@ class Matches(MatchColumns):
             pyarrow Table, a DuckDB result); a mapping of arrays or lists; or a structured array.
         **options
             Fields of `ReadOptions` by name: columns, unit, sigma, pixel_origin, tangent_point,
-            epoch, catalogue_epoch, chips, not_finite, same_position, plate_scale.
+            epoch, catalogue_epoch, chips, not_finite, same_position, plate_scale,
+            motion_prior.
 
         Returns
         -------

@@ -64,7 +64,8 @@ def read_matches(
         mission, or 'auto': recognized by name and content.
     **options
         Fields of `ReadOptions` by name: columns, unit, sigma, pixel_origin, tangent_point, epoch,
-        catalogue_epoch, chips, not_finite, same_position, plate_scale.
+        catalogue_epoch, chips, not_finite, same_position, plate_scale,
+        motion_prior.
 
     Returns
     -------
@@ -206,7 +207,8 @@ def _is_of_masters(key: str) -> bool:
 def _read_list(key: str, file: Path, name: str | None, options: ReadOptions) -> Matches:
     """Matches of a list in a format that fixes its columns."""
     names = "columns tangent_point epoch catalogue_epoch not_finite same_position plate_scale"
-    options.refuse_fixed(str(file), key, *names.split(), *_other_origin(options))
+    fixed = (*names.split(), "motion_prior", *_other_origin(options))
+    options.refuse_fixed(str(file), key, *fixed)
     if options.unit not in (None, "pix"):
         options.refuse_fixed(str(file), key, "unit")
     read = required(mission_formats()[key].matches, f"the format {key!r} has no matches")
@@ -216,7 +218,7 @@ def _read_list(key: str, file: Path, name: str | None, options: ReadOptions) -> 
 def _read_record(file: Path, options: ReadOptions) -> Matches:
     """Matches of a file that bayesdist wrote; it fixes everything that the options could set."""
     names = "columns unit tangent_point epoch catalogue_epoch chips not_finite same_position"
-    fixed = (*names.split(), "plate_scale", *_other_origin(options))
+    fixed = (*names.split(), "plate_scale", "motion_prior", *_other_origin(options))
     options.refuse_fixed(str(file), "bayesdist", *fixed)
     return read_written_matches(file)
 
@@ -242,6 +244,7 @@ def _read_corr(file: Path, table: Table, name: str | None, options: ReadOptions)
         "the format astrometry.net has no proper motions and would not use it",
         "epoch",
         "catalogue_epoch",
+        "motion_prior",
         do="leave {} out, or set the format to 'table' and name the columns (columns = "
         '{{x = "field_x", y = "field_y", ra = "index_ra", dec = "index_dec"}}, and pm_ra, pm_dec)',
     )

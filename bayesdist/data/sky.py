@@ -43,10 +43,10 @@ if TYPE_CHECKING:
     from bayesdist.data.tables.column import Quantities, SourceColumn
 
 MOTIONS = ("pm_ra", "pm_dec", "sigma_pm_ra", "sigma_pm_dec")
-# quantities that may be missing for a star, which then count as zero
 # pairs of the five astrometric parameters, in the order of the rows of their covariance
 PARAMETERS = ("ra", "dec", "parallax", "pm_ra", "pm_dec")
 CORRELATIONS = frozenset(f"corr_{first}_{second}" for first, second in combinations(PARAMETERS, 2))
+# quantities that may be missing for a star, which then count as zero
 SPARED = ("parallax", "sigma_parallax", *sorted(CORRELATIONS))
 SKY_QUANTITIES = ("sigma_ra", "sigma_dec", *MOTIONS, *SPARED, "catalogue_epoch")
 # parsecs; without a radial velocity, the path on the sky does not depend on the distance
@@ -252,6 +252,9 @@ def _errors_at(
         unit = "arcsec / yr" if name.startswith("pm_") else "arcsec"
         values = _optional(quantities, f"sigma_{name}", unit)
         if values is not None:
+            if (values < 0).any():
+                bad = int(np.argmax(values < 0))
+                raise quantities[f"sigma_{name}"].fail(bad, f"an error is {values[bad]:g}")
             sigma[name] = values
     for first, second in combinations(names, 2):
         values = _optional(quantities, f"corr_{first}_{second}", "")

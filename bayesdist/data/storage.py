@@ -163,6 +163,12 @@ def open_matches(path: PathLike | Sequence[PathLike], **options: Unpack[ReadArgu
             where="data.plate_scale",
             do="write u, v and their errors in arcsec",
         )
+    if reading.motion_prior is not None:
+        raise InputError(
+            "stars of tables on disk get no motion from others",
+            where="data.motion_prior",
+            do="write the motions and their errors into the table",
+        )
     files = input_files(path)
     for file in files:
         if file.suffix.lower() != ".parquet":

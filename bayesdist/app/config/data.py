@@ -52,6 +52,7 @@ class Data(Section):
     tangent_point: RightAscensionDeclination | None = None
     epoch: Epoch | str | None = None
     catalogue_epoch: Epoch | None = None
+    motion_prior: PositiveFloat | None = None  # mas per year
     not_finite: Literal["refuse", "reject"] = "refuse"
     same_position: Literal["one_star", "separate_stars"] = "one_star"
     simulated: bool = False

@@ -32,6 +32,7 @@ class ReadArguments(TypedDict, total=False):
     not_finite: str
     same_position: str
     plate_scale: float | None
+    motion_prior: float | None
 
 
 @dataclass(frozen=True)
@@ -77,12 +78,16 @@ class ReadOptions:
         Arcsec per millimetre, for u and v in a length unit (of a focal plane, a mask or a
         metrology), which is stated in the file or by `unit`. Positions and errors are converted to
         arcsec.
+    motion_prior : float, optional
+        Standard deviation on each axis, in mas per year, of the motions of stars without a measured
+        one. The default is the scatter of the other stars, if there are at least 30; with fewer,
+        and in tables without errors of positions and motions, such stars are left out.
 
     Raises
     ------
     InputError
         If `sigma`, `not_finite` or `same_position` is none of these values, or if `plate_scale`,
-        the tangent point or an epoch is invalid.
+        `motion_prior`, the tangent point or an epoch is invalid.
     """
 
     columns: Mapping[str, str] | None = None
@@ -96,6 +101,7 @@ class ReadOptions:
     not_finite: str = "refuse"
     same_position: str = "one_star"
     plate_scale: float | None = None
+    motion_prior: float | None = None
 
     def __post_init__(self) -> None:
         check_sigma(self.sigma)
@@ -106,6 +112,12 @@ class ReadOptions:
                 f"plate_scale is {self.plate_scale}",
                 where="data.plate_scale",
                 do="give a positive number of arcsec per mm",
+            )
+        if self.motion_prior is not None and not 0 < self.motion_prior < np.inf:
+            raise InputError(
+                f"motion_prior is {self.motion_prior}",
+                where="data.motion_prior",
+                do="give a positive number of mas per year",
             )
         if self.tangent_point is not None:
             point = direction_in(self.tangent_point, "tangent_point", where="data.tangent_point")

@@ -16,6 +16,7 @@ from astropy.time import Time
 
 from bayesdist.data.output import header_arguments
 from bayesdist.data.reading.columns import columns_read, is_on_sky, match_columns
+from bayesdist.data.reading.motions import with_prior_motions
 from bayesdist.data.reading.options import ReadOptions
 from bayesdist.data.repeated import star_codes
 from bayesdist.data.sky import MOTIONS, SPARED, sky_columns
@@ -263,6 +264,15 @@ def match_arguments(
     moves = (
         "pm_ra" in column_names and dated and ("epoch" in column_names or options.epoch is not None)
     )
+    if moves:
+        table, of_motions = with_prior_motions(
+            table,
+            column_names,
+            source=source,
+            sigma_mas_yr=options.motion_prior,
+            reject=options.not_finite == "reject",
+        )
+        notes = (*notes, *of_motions)
     rows_with_values = partial(
         without_missing,
         table,

@@ -46,6 +46,7 @@ def reading_options(data: Data, chips: Sequence[ChipBlock]) -> dict[str, Any]:
     names = (
         *("format", "columns", "unit", "sigma", "pixel_origin", "tangent_point"),
         *("epoch", "catalogue_epoch", "not_finite", "same_position", "plate_scale"),
+        "motion_prior",
     )
     numbers = {chip.name: chip.number for chip in chips}
     return {name: getattr(data, name) for name in names} | {"chips": numbers or None}
