@@ -104,6 +104,34 @@ def test_sextractor_has_variances_and_a_covariance(rng):
     )
 
 
+@pytest.mark.parametrize("kind", ["", "WIN", "PSF"])
+def test_sextractor_has_ellipses(rng, kind):
+    """Semi-axes and the angle from x to y, as matplotlib or ds9 draw them."""
+    table, angle = stars(rng), rng.uniform(-90, 90, N)
+    a, b = rng.uniform(0.02, 0.06, N), rng.uniform(0.005, 0.02, N)
+    table[f"ERRA{kind}_IMAGE"], table[f"ERRB{kind}_IMAGE"] = a, b
+    table["ERRTHTPSF_IMAGE" if kind == "PSF" else f"ERRTHETA{kind}_IMAGE"] = angle
+    c, s = np.cos(np.radians(angle)), np.sin(np.radians(angle))
+    turn = np.moveaxis(np.array([[c, -s], [s, c]]), -1, 0)
+    axes = np.array([np.diag(pair) for pair in np.stack([a**2, b**2], axis=1)])
+    expected = SCALE**2 * R @ turn @ axes @ np.swapaxes(turn, 1, 2) @ R.T
+    found = matches_from_table(table, ReadOptions(unit="arcsec"))
+    np.testing.assert_allclose(covariances(found), expected, rtol=2e-3, atol=1e-9)
+    # variances alone are completed by the covariance of the ellipse
+    C = turn @ axes @ np.swapaxes(turn, 1, 2)
+    table[f"ERRX2{kind}_IMAGE"], table[f"ERRY2{kind}_IMAGE"] = C[:, 0, 0], C[:, 1, 1]
+    found = matches_from_table(table, ReadOptions(unit="arcsec"))
+    np.testing.assert_allclose(covariances(found), expected, rtol=2e-3, atol=1e-9)
+    table[f"ERRB{kind}_IMAGE"][6] = 0.0
+    with pytest.raises(InputError, match=f"row 7, column 'ERRB{kind}_IMAGE'"):
+        matches_from_table(table, ReadOptions(unit="arcsec"))
+    # errors of another program stand beside them
+    table["x_err"] = table["y_err"] = 0.01
+    table.remove_columns([f"ERRX2{kind}_IMAGE", f"ERRY2{kind}_IMAGE"])
+    found = matches_from_table(table, ReadOptions(unit="arcsec"))
+    np.testing.assert_allclose(found.sigma_u, 0.01 * SCALE, rtol=2e-3)
+
+
 def test_stars_on_disk_have_the_same_errors(rng, tmp_path):
     table = stars(rng, x_err=np.full(N, 0.02), y_err=np.full(N, 0.04))
     table.write(tmp_path / "stars.parquet")

@@ -40,6 +40,7 @@ from bayesdist.data.matching.similarity import (
     grown_map,
     pattern_index,
 )
+from bayesdist.data.reading.centroids import with_variances
 from bayesdist.data.reading.columns import CENTROIDS
 from bayesdist.data.reading.options import ReadOptions
 from bayesdist.data.reading.table import (
@@ -265,7 +266,7 @@ def _table_of(data: Any, source: str) -> Table:
         data = read_table(Path(data))
     if isinstance(data, Matches):
         data = data.to_table()
-    table = with_sky_columns(as_table(data, source))
+    table = with_variances(with_sky_columns(as_table(data, source)), source)
     if not len(table):
         raise InputError("holds no rows", where=source, do="give a table with stars")
     return table

@@ -11,13 +11,25 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from astropy.table import MaskedColumn, Table
 
 from bayesdist.data.covariances import covariances_of, errors_of
 from bayesdist.data.robust import robust_fit
-from bayesdist.data.tables.column import Quantities, SourceColumn
+from bayesdist.data.tables.checks import row_number
+from bayesdist.data.tables.column import Quantities, SourceColumn, without_unit
+from bayesdist.data.tables.names import ALIASES
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Bool, Float
 
+# SExtractor's names of the axes of an error ellipse, the angle from x towards y in degrees, and the
+# variances and covariance that are the same as these
+ELLIPSES = tuple(
+    (
+        (f"erra{kind}_image", f"errb{kind}_image", f"{angle}{kind}_image"),
+        (f"errx2{kind}_image", f"erry2{kind}_image", f"errxy{kind}_image"),
+    )
+    for kind, angle in (("win", "errtheta"), ("psf", "errtht"), ("", "errtheta"))
+)
 VARIANCES = ("errx2", "erry2", "errxy")  # beginnings of SExtractor's names of variances
 MIN_MATCHES = 4
 MIN_ROWS = 30  # of a chip and exposure with a Jacobian of its own
@@ -56,6 +68,41 @@ def with_centroid_errors(quantities: Quantities, columns: Mapping[str, Any]) -> 
         total += covariances_of(columns["sigma_u"], columns["sigma_v"], columns.get("rho_uv", 0.0))
         note += " and added to those of the catalogue"
     return {**errors_of(total), "notes": (*columns.get("notes", ()), note)}
+
+
+def with_variances(table: Table, source: str) -> Table:
+    """Table with variances and covariance of x and y where it has SExtractor's error ellipses.
+
+    The first complete ellipse is used, of windowed, PSF or isophotal positions.  The table is
+    returned unchanged if it has none, or other errors of x and y.  Raises InputError by row if an
+    axis is not positive.
+    """
+    lower = {name.lower(): name for name in table.colnames}
+    for axes, variances in ELLIPSES:
+        if not lower.keys() >= set(axes):
+            continue
+        others = {*ALIASES["sigma_x"], *ALIASES["sigma_y"], *ALIASES["rho_xy"]} - set(variances)
+        if lower.keys() & others or variances[2] in lower:
+            return table
+        columns = [np.ma.asarray(without_unit(table[lower[name]])) for name in axes]
+        for name, values in zip(axes[:2], columns, strict=False):
+            bad = np.ma.filled(values <= 0, fill_value=False)
+            if bad.any():
+                row = int(np.argmax(bad))
+                raise InputError(
+                    f"an axis of an error ellipse is {values[row]:g}",
+                    where=f"{source}, {row_number(row)}, column {lower[name]!r}",
+                    do="correct the row or drop it",
+                )
+        a2, b2 = columns[0] ** 2, columns[1] ** 2
+        cos, sin = np.ma.cos(np.radians(columns[2])), np.ma.sin(np.radians(columns[2]))
+        made = (a2 * cos**2 + b2 * sin**2, a2 * sin**2 + b2 * cos**2, (a2 - b2) * sin * cos)
+        out = table.copy(copy_data=False)
+        for name, values in zip(variances, made, strict=True):
+            if name not in lower:
+                out[name] = MaskedColumn(values)
+        return out
+    return table
 
 
 def pixel_covariances(quantities: Quantities) -> Float:

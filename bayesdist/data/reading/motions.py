@@ -170,11 +170,11 @@ def _prior(values: Float, magnitude: Float, measured: Bool, at: Bool) -> tuple[F
     They are those of the bin of measured stars that is next in magnitude.  Zero without measured
     stars.
     """
-    n = np.count_nonzero(at)
+    n = int(at.sum())
     if not measured.any():
         return np.zeros(n), np.zeros(n)
     known = measured & np.isfinite(magnitude)
-    n_bins = min(MOST_BINS, np.count_nonzero(known) // PER_BIN)
+    n_bins = min(MOST_BINS, int(known.sum()) // PER_BIN)
     mean, sigma = (np.full(n, number) for number in _normal(values[measured]))
     if n_bins < 2:
         return mean, sigma

@@ -15,6 +15,7 @@ from astropy.table import Column, MaskedColumn, QTable, Table
 from astropy.time import Time
 
 from bayesdist.data.output import header_arguments
+from bayesdist.data.reading.centroids import with_variances
 from bayesdist.data.reading.columns import columns_read, is_on_sky, match_columns
 from bayesdist.data.reading.motions import with_prior_motions
 from bayesdist.data.reading.options import ReadOptions
@@ -251,7 +252,7 @@ def match_arguments(
         units are missing or contradictory, or if there are no rows.
     """
     options = options or ReadOptions()
-    table = with_sky_columns(as_table(data, source))
+    table = with_variances(with_sky_columns(as_table(data, source)), source)
     column_names, options, notes = columns_read(table.colnames, table.meta, options, source=source)
     if len(table) == 0:
         raise InputError("holds no rows", where=source, do="give a table with matched stars")
