@@ -65,13 +65,19 @@ def _group(group: h5py.Group) -> NetcdfGroup:
     arrays = {
         name: (dataset.asstr() if h5py.check_string_dtype(dataset.dtype) else dataset)[...]
         for name, dataset in group.items()
-        if isinstance(dataset, h5py.Dataset)
+        if isinstance(dataset, h5py.Dataset) and not _is_bare_dimension(dataset)
     }
     attrs = {
         name: value[0] if isinstance(value, np.ndarray) and value.shape == (1,) else value
         for name, value in group.attrs.items()
     }
     return NetcdfGroup(arrays, attrs)
+
+
+def _is_bare_dimension(dataset: h5py.Dataset) -> bool:
+    """True for a dimension without values, for which netCDF stores an array of zeros."""
+    title = dataset.attrs.get("NAME", b"")
+    return isinstance(title, bytes) and title.startswith(b"This is a netCDF dimension but not")
 
 
 @contextmanager

@@ -1,6 +1,7 @@
 """Read and write solutions as netCDF files.
 
-Files are replaced atomically; any problem in reading raises a single `FormatError`.
+Files are replaced atomically; any problem in reading raises a single `FormatError`. A checksum
+shows whether the content has been changed.
 
 fit.nc holds a linear fit. posterior.nc holds a posterior as a tree that ArviZ and xarray can open,
 with the groups posterior, sample_stats and diagnostics. For tables in memory it also has
@@ -10,6 +11,7 @@ larger data are written to separate files in `stars/`.
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
 from collections.abc import Iterator, Mapping
@@ -28,7 +30,7 @@ from bayesdist.errors import FormatError
 from bayesdist.files.atomic import atomic_path
 from bayesdist.files.documents import json_of
 from bayesdist.files.faults import restoring
-from bayesdist.files.hdf5 import netcdf_groups
+from bayesdist.files.hdf5 import NetcdfGroup, netcdf_groups
 from bayesdist.infer.convergence import DIAGNOSTICS, Convergence, Limits
 from bayesdist.infer.posterior import Posterior, SamplerInfo
 from bayesdist.infer.posterior.memberships import memberships, star_log_likelihood
@@ -43,8 +45,9 @@ if TYPE_CHECKING:
 
 MOST_STARS = 1_000_000  # the file repeats the data of at most this many stars
 LARGEST = 16_000_000  # bytes; a larger log-likelihood (per star and draw) is not stored
-LEAST_RHAT = 0.5  # plausibility limit; even chains of four draws have at least 0.87
 FIT_NUMBERS = ("n_rows", "n_used", "rms_u", "rms_v", "rms_rejected", "chi2", "dof", "condition")
+CHECKED = ("", "posterior", "sample_stats", "diagnostics")  # groups of posterior.nc that are read
+UNCHECKED = ("checksum", "provenance", "wall_s")  # the last two differ between equal runs
 
 
 @takes(posterior=Posterior, matches=(Matches, NoneType))
@@ -205,6 +208,8 @@ def load_posterior(path: str | Path) -> Posterior:
         mixture = _tree(attrs["mixture"])
         mixture["fraction_prior"] = tuple(mixture["fraction_prior"])
         info: dict[str, Any] = {str(k): _plain(v) for k, v in stats.attrs.items()}
+        if not 0 <= info["wall_s"] < np.inf:
+            raise ValueError("the sampling took no finite time")
         model = DistortionModel.from_dict(_tree(attrs["model"]))
         theta, log_prob = draws["theta"], stats.arrays["lp"]
         hyper = {str(name): draws[name] for name in ("j", "f", "s_out") if name in draws}
@@ -214,9 +219,7 @@ def load_posterior(path: str | Path) -> Posterior:
             _refuse_other_shape(values, shape[:2])
         for check in DIAGNOSTICS:  # NaN where a parameter does not move
             _refuse_other_shape(np.nan_to_num(checks[check]), checks["sampled"].shape)
-        if (checks["rhat"] < LEAST_RHAT).any():  # False for NaN
-            raise FormatError(f"R-hat is below {LEAST_RHAT}, which no draws have")
-        return Posterior(
+        posterior = Posterior(
             model=model,
             mixture=OutlierMixture(**mixture),
             theta=theta,
@@ -239,6 +242,8 @@ def load_posterior(path: str | Path) -> Posterior:
             own_places=bool(attrs.get("own_places", False)),
             tangent_point=_tangent_point(attrs),
         )
+        _refuse_changed({name: groups[name] for name in CHECKED})
+        return posterior
 
 
 def _tangent_point(attrs: Mapping[str, Any]) -> tuple[float, float] | None:
@@ -253,6 +258,27 @@ def _refuse_other_shape(values: NDArray[Any], shape: tuple[int, ...]) -> None:
         raise ValueError(f"an array has the shape {values.shape} instead of {shape}")
     if values.dtype.kind not in "fiu" or not np.isfinite(values).all():
         raise ValueError("an array has values that are not finite")
+
+
+def _checksum(groups: Mapping[str, NetcdfGroup]) -> str:
+    """SHA-256 of the content of groups, apart from the attributes `UNCHECKED`."""
+    digest = hashlib.sha256()
+    for group_name, group in sorted(groups.items()):
+        names = [name for name in sorted(group.attrs) if name not in UNCHECKED and name[0] != "_"]
+        attributes = [[name, np.asarray(group.attrs[name]).tolist()] for name in names]
+        digest.update(f"{group_name} {json.dumps(attributes)}\n".encode())
+        for name, values in sorted(group.arrays.items()):
+            is_text = values.dtype.kind in "OU"
+            kind = "text" if is_text else values.dtype.str
+            digest.update(f"{name} {kind} {values.shape}\n".encode())
+            digest.update(json.dumps(values.tolist()).encode() if is_text else values.tobytes())
+    return digest.hexdigest()
+
+
+def _refuse_changed(groups: Mapping[str, NetcdfGroup]) -> None:
+    """Raise FormatError if the content of a file contradicts its checksum."""
+    if groups[""].attrs["checksum"] != _checksum(groups):
+        raise FormatError("its content contradicts its checksum: it is damaged or was changed")
 
 
 def _tree(text: object) -> Any:
@@ -323,11 +349,13 @@ def load_fit(path: str | Path) -> LinearFit:
     with _reading(path, "a fit", "fit"):
         top = netcdf_groups(path)[""]
         data, attrs = top.arrays, top.attrs
+        if attrs.get("creator") != "bayesdist":
+            raise KeyError("creator")
         model = DistortionModel.from_dict(_tree(attrs["model"]))
         n = len(model.names)
         for name, shape in (("mean", (n,)), ("cov", (n, n)), ("clip", (n,))):
             _refuse_other_shape(data[name], shape)
-        return LinearFit(
+        fit = LinearFit(
             model=model,
             mean=data["mean"],
             cov=data["cov"],
@@ -340,6 +368,8 @@ def load_fit(path: str | Path) -> LinearFit:
             tangent_point=_tangent_point(attrs),
             **{name: attrs[name].item() for name in FIT_NUMBERS},
         )
+        _refuse_changed({"": top})
+        return fit
 
 
 def _write(groups: Mapping[str, Group], path: str | Path) -> None:
@@ -351,8 +381,17 @@ def _write(groups: Mapping[str, Group], path: str | Path) -> None:
     with h5netcdf.File(buffer, "w") as file:
         for name, group in groups.items():
             _fill(file.create_group(name) if name else file, group)
+        file.attrs["checksum"] = _checksum(
+            {name: _as_read(groups[name]) for name in CHECKED if name in groups}
+        )
     with atomic_path(path) as temporary:
         temporary.write_bytes(buffer.getvalue())
+
+
+def _as_read(group: Group) -> NetcdfGroup:
+    """Content of a group as `netcdf_groups` returns it."""
+    arrays = {name: np.asarray(content) for name, (_, content) in group.variables.items()}
+    return NetcdfGroup(arrays, dict(group.attrs))
 
 
 def _fill(target: h5netcdf.Group, group: Group) -> None:

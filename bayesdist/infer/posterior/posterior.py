@@ -21,7 +21,7 @@ from bayesdist.utils.quantities import Random, generator_of
 if TYPE_CHECKING:
     import xarray
 
-SCHEMA = 3  # version of the layout of posterior.nc
+SCHEMA = 4  # version of the layout of posterior.nc
 POSTERIOR_NUMBERS = ("n_stars", "n_flagged", "n_false", "reference_sigma")
 
 SAMPLED = ("chain", "draw")  # dimensions that are numbered from 0
