@@ -64,6 +64,22 @@ def _refuse_unfounded(raw: bytes, budget: Budget) -> None:
         at, number = begin + padded(size), number + 1
         budget.refuse_parts(number, "HDUs")
         clock()
+    if number:
+        refuse_cut_records(raw, budget)
+
+
+def refuse_cut_records(raw: bytes, budget: Budget) -> None:
+    """Raise FormatError if a file is not a multiple of records long (FITS 4.0, section 3.1).
+
+    Its HDUs may be complete, and further ones missing.
+    """
+    if len(raw) % RECORD:
+        raise FormatError(
+            f"has {len(raw)} bytes, which are not whole records of {RECORD}, so that further HDUs "
+            "may be missing",
+            where=budget.where,
+            do="it is truncated or damaged: fetch or write it again",
+        )
 
 
 def refuse_many_rows(header: fits.Header, budget: Budget) -> None:

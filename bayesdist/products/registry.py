@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.errors import InputError, required
 from bayesdist.files.atomic import refuse_unsafe_name
+from bayesdist.files.fits import refuse_cut_records
 from bayesdist.plugin import objects
 from bayesdist.products.common.content import Content, read_content, readable
 from bayesdist.products.common.document import (
@@ -73,6 +74,9 @@ def open_document(path: str | os.PathLike[str]) -> Document:
 
 def recognized(content: Content) -> Document:
     """Document of content in memory; see `open_document`."""
+    with readable(content.name):
+        if content.is_fits and all(hdu.state == "whole" for hdu in content.hdus):
+            refuse_cut_records(content.raw, content.budget)
     for format_ in all_formats():
         with readable(content.name):
             holds = format_.parse(content)
