@@ -36,6 +36,7 @@ from bayesdist.data.covariances import LARGEST_RHO, covariances_of, errors_of
 from bayesdist.data.tables.checks import Place, row_number, zero_motions
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Bool, Float
+from bayesdist.utils.quantities import LARGEST_RA
 
 if TYPE_CHECKING:
     from astropy.time import Time
@@ -74,9 +75,14 @@ class ReferenceSky:
 def sky_columns(quantities: Quantities) -> tuple[Float, Float]:
     """Right ascension and declination (N,) of the rows of a table, converted to degrees.
 
-    Raises InputError if a declination is beyond 90 degrees.
+    Raises InputError if a declination is beyond 90 degrees, or a right ascension beyond
+    `LARGEST_RA`.
     """
     ra, dec = (_degrees(quantities[key], key) for key in ("ra", "dec"))
+    outside = np.abs(ra) > LARGEST_RA
+    if outside.any():
+        bad = int(np.argmax(outside))
+        raise quantities["ra"].fail(bad, f"right ascension is {ra[bad]:g} degrees")
     beyond = np.abs(dec) > 90.0
     if beyond.any():
         bad = int(np.argmax(beyond))

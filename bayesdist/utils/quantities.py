@@ -39,6 +39,7 @@ Epoch: TypeAlias = Union[float, str, date, "Time", "Quantity"]
 Direction: TypeAlias = Union[tuple[float, float], "SkyCoord", tuple["Quantity", "Quantity"]]
 Random: TypeAlias = int | np.random.Generator
 YEARS = (1800.0, 2200.0)  # decimal years; epochs outside are in another unit or not dates
+LARGEST_RA = 720.0  # degrees; some programs continue beyond 360 in a field around zero
 UNITS = ("pix", "arcsec", "mas", "deg")
 _OF_A_SOLUTION = "Posterior or LinearFit"  # what users have of the abstract class
 _OF_A_TABLE = "; bayesdist.Matches.from_table makes it of a table"
@@ -256,7 +257,7 @@ def direction_in(point: Direction, what: str, *, where: str = "") -> tuple[float
             f"{what} is {point!r}, which is not a direction", where=where, do=do
         ) from None
     ra, dec = (value_in(coordinate, "deg", what, where=where) for coordinate in (ra, dec))
-    if not (np.isfinite(ra) and abs(dec) <= 90.0):
+    if not (abs(ra) <= LARGEST_RA and abs(dec) <= 90.0):
         raise InputError(
             f"{what} is ({ra:g}, {dec:g}), which is not a direction", where=where, do=do
         )

@@ -102,6 +102,7 @@ CASES = [
     ),
     ("mirrored", change(x=lambda t: 1001 - t["x"]), {}, "counted from the wrong side"),
     ("sign of declination", change(dec=lambda t: -t["dec"]), {}, "shows the sky mirrored"),
+    ("turns", change(ra=lambda t: t["ra"] + 1e204), {}, "right ascension is 1e+204 degrees"),
     ("pole", change(dec=lambda t: t["dec"] + 50), {}, "declination is 97.2"),
     ("wrong pairs", shuffled, {}, "another field, wrong pairs"),
     ("from the pixels", copied, {}, "computed from the pixels by a WCS"),
