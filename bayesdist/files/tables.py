@@ -44,6 +44,7 @@ from bayesdist.files.text_tables import (
     refuse_missing_cells,
     refuse_multiplied_header,
     refuse_numbers_as_names,
+    refuse_open_quotes,
     with_decimal_points,
     without_empty_names,
 )
@@ -106,6 +107,7 @@ def read_ecsv(path: Path, limits: Limits = LIMITS) -> Table:
         mark = _mark_of_ecsv(lines)
         lines = _whole_lines(lines, mark, path)
         table = Table.read(lines, format="ascii.ecsv")
+        refuse_open_quotes(lines, len(table), where=str(path))
         if any(map(MAYBE_FOREIGN.search, lines)):  # else the header need not be parsed again
             refuse_foreign_numbers(_columns_of_ecsv(lines), lines, mark, where=str(path))
         return table
@@ -138,6 +140,7 @@ def _read_separated(path: Path, limits: Limits, *, mark: str) -> Table:
     # the time astropy needs for a comment grows with the square of its length
     lines = with_decimal_points([line for line in lines if line[:1] != "#"], mark, where=str(path))
     table = Table.read(lines, format="ascii.csv", delimiter=mark, comment="#", guess=False)
+    refuse_open_quotes(lines, len(table), where=str(path))
     refuse_foreign_numbers(columns_of_numbers(table), lines, mark, where=str(path))
     return table
 

@@ -179,7 +179,8 @@ def parse_text_table(lines: Sequence[str], budget: Budget) -> Table:
             where=file_name,
             do="write one above the numbers",
         )
-    if kind == "ascii.ecsv":
+    ecsv = kind == "ascii.ecsv"
+    if ecsv:
         refuse_multiplied_header(lines, budget)
     rows = _rows_of(lines)
     named = sum(1 for line in lines if line.startswith("#")) if kind == "ascii.sextractor" else 0
@@ -209,6 +210,8 @@ def parse_text_table(lines: Sequence[str], budget: Budget) -> Table:
         elif mark == ";":
             options["delimiter"] = mark
     table = Table.read(lines, format=kind, guess=False, **options)
+    if kind != "ascii.daophot":  # one row has several lines
+        refuse_open_quotes(lines, len(table), where=file_name, names=separated or ecsv)
     refuse_foreign_numbers(columns_of_numbers(table), lines, mark, where=file_name)
     return table
 
@@ -242,6 +245,33 @@ def refuse_missing_cells(lines: Sequence[str], mark: str, *, where: str) -> None
                 do="the table may be truncated: fetch or write it again",
             )
         width, row = width or len(cells), row + 1
+
+
+def refuse_open_quotes(
+    lines: Sequence[str], n_rows: int, *, where: str, names: bool = True
+) -> None:
+    """Raise FormatError if a quotation mark that is not closed in its line has swallowed rows.
+
+    `lines`: lines of the table. `n_rows`: number of rows that were read. `names`: True if a line of
+    column names is among the lines that are not comments.
+    """
+    if not any('"' in line for line in lines):
+        return
+    rows = [
+        (number, line)
+        for number, line in enumerate(lines, start=1)
+        if line.strip() and not line.lstrip().startswith(("#", "\\", "|"))
+    ]
+    n_lines = len(rows) - names
+    if n_rows >= n_lines:
+        return
+    odd = next((number for number, line in rows if line.count('"') % 2), None)
+    raise FormatError(
+        f"has {n_lines} rows, of which {n_rows} can be read, since a cell begins with a quotation "
+        'mark (") and does not end in its line',
+        where=where if odd is None else f"{where}, line {odd}",
+        do="close or remove the quotation mark, and write no line breaks within a cell",
+    )
 
 
 def refuse_cut_end(lines: Sequence[str], mark: str | None, *, where: str) -> None:

@@ -65,3 +65,34 @@ def test_numbers_in_full_precision_are_warned_of_or_refused_when_little_is_left(
     path.write_text(text[: text.rindex(",") + 5])
     with pytest.raises(FormatError, match="ends within its last number"):
         read_table(path)
+
+
+def test_open_quotation_marks_swallow_no_rows(tmp_path, rng):
+    """One in the last column, and two, between which rows would be the text of a cell."""
+    table = Table({name: rng.normal(size=30).round(4) for name in "xyuv"})
+    table["name"] = [f"star{k}" for k in range(30)]
+    for name, options in KINDS.items():
+        path = tmp_path / name
+        table.write(path, **options)
+        assert list(read_table(path)["name"]) == list(table["name"])
+        lines = path.read_text().splitlines()
+        for rows in ([10], [10, 20]):
+            damaged = list(lines)
+            for row in rows:
+                damaged[row] = damaged[row][: damaged[row].rfind("star")].rstrip('"') + '"'
+            path.write_text("\n".join(damaged) + "\n")
+            with pytest.raises(FormatError, match=r"cells|quotation mark|cannot be read as"):
+                read_table(path)
+
+
+def test_a_fits_file_whose_last_record_is_not_whole(tmp_path):
+    """The objects of a further chip may be missing."""
+    path = tmp_path / "stars.fits"
+    Table({"x": [1.0, 2.0]}).write(path)
+    raw = path.read_bytes()
+    for damaged in (raw[:-1], raw + b"XTENS"):
+        path.write_bytes(damaged)
+        with pytest.raises(FormatError, match=r"not whole records of 2880"):
+            read_table(path)
+    path.write_bytes(raw + bytes(2880))  # as on tapes
+    assert len(read_table(path)) == 2
