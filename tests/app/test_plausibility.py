@@ -288,6 +288,10 @@ REQUIREMENT = '[[requirement]]\nname = "a"\nstatistic = "max"\nlimit = 1\nregion
 DEEP = "[" * 3000 + "]" * 3000
 
 
+def requirement(more: str) -> str:
+    return f'[[requirement]]\nname = "a"\nstatistic = "p95"\nlimit = 1.0\n{more}'
+
+
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
@@ -304,6 +308,10 @@ DEEP = "[" * 3000 + "]" * 3000
         ({"more": "[fit]\nclip_abs = 1e12"}, "fit.clip_abs: 1000000000000.0 does not fit"),
         ({"more": "[assess]\ngrid = [100000, 100000]"}, "assess.grid[1]: 100000 does not fit"),
         ({"more": "[assess]\ndraws = 1000000000"}, "assess.draws: 1000000000 does not fit"),
+        (
+            {"more": requirement("region = [[1, 1], [nan, 1], [5, 5]]")},
+            "requirement[1].region[2][1]: nan does not fit; give a finite number",
+        ),
         ({"more": "[sampler]\nensembles = 1000000"}, "sampler.ensembles: 1000000 does not fit"),
         (
             {"detector": "field = [[1, 1], [nan, 9], [9, 9]]"},

@@ -58,7 +58,11 @@ def as_config_error(
     if first["type"] in ("value_error", "no_kind"):
         cause, _, do = first["msg"].removeprefix("Value error, ").partition("; ")
         return ConfigError(cause, where=where, do=do)
-    # there is one detail for each type that the value may have
+    # there is one detail for each type that the value may have; if the value is of one of these
+    # types but for a part, that part is the cause
+    parts = [e for e in details if _dotted(e["loc"]).startswith((f"{key}[", f"{key}."))]
+    if parts:
+        first, key = parts[0], _dotted(parts[0]["loc"])
     wanted = dict.fromkeys(_wanted(e) for e in details if _dotted(e["loc"]) == key)
     return ConfigError(
         f"{first['input']!r} does not fit",
