@@ -51,7 +51,8 @@ source = "exact"
 [[budget]]
 name = "centroid"
 kind = "random"
-sigma = 0.01
+sigma_u = 0.01
+sigma_v = 0.01
 
 [[requirement]]
 name = "loose"
