@@ -123,7 +123,7 @@ class ChiSquare:
                 "together, by more than its stated error: state the errors of both as they are"
             )
         if self.radius_doubt:
-            why = f"{self.radius_doubt}; otherwise, {why}"
+            why = f"{self.radius_doubt}; otherwise the jitter takes up what is not quoted"
         if findings:
             why = (
                 f"the model does not describe all positions ({', '.join(findings)}): follow that "
