@@ -70,10 +70,12 @@ class InterruptHandler:
         """Hook for `sys.unraisablehook`: repeat an interrupt that Python would print and ignore.
 
         Python ignores exceptions in destructors and in callbacks of weak references, which may run
-        at any time.
+        at any time. After an interrupt their other exceptions are not printed, since destructors of
+        objects whose construction was interrupted fail.
         """
         if not isinstance(unraisable.exc_value, KeyboardInterrupt):
-            sys.__unraisablehook__(unraisable)
+            if not self.n:
+                sys.__unraisablehook__(unraisable)
             return
         self._last = -math.inf
         number = signal.SIGTERM if self.terminated else signal.SIGINT

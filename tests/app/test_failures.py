@@ -104,7 +104,17 @@ def test_a_second_interrupt_leaves_the_first_one_to_its_end():
                 signal.raise_signal(signal.SIGINT)
 
 
-def test_an_interrupt_in_a_destructor_is_not_lost():
+OPEN = {
+    "in the destructor": "def __del__(self): signal.raise_signal(signal.{})",
+    "half-made": (
+        "def __init__(self): signal.raise_signal(signal.{}); self.closed = False\n"
+        "    def __del__(self): assert self.closed"
+    ),
+}
+
+
+@pytest.mark.parametrize("how", OPEN)
+def test_an_interrupt_is_not_lost_and_leaves_one_sentence(how):
     """Python prints exceptions in destructors and goes on."""
     code = (
         "import signal, sys, time, click\n"
@@ -112,7 +122,7 @@ def test_an_interrupt_in_a_destructor_is_not_lost():
         # jobs in the background inherit that SIGINT is ignored
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "class Open:\n"
-        "    def __del__(self): signal.raise_signal(signal.{})\n"
+        f"    {OPEN[how]}\n"
         "@click.command()\n"
         "def fails():\n"
         "    Open(); time.sleep(60)\n"

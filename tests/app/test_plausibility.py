@@ -243,6 +243,17 @@ def test_pixels_that_are_called_an_angle(rng):
     assert doubts(stars(rng, 0.05, "arcsec", 1e-3), detector="scale_mas = 50.0") == []
 
 
+def test_the_scale_of_a_mosaic_is_that_of_its_chips(rng):
+    """Chips side by side span many times the pixels of one."""
+    n = 1600
+    chip = rng.integers(0, 64, n)
+    found = stars(rng, n=n, chip=chip, chip_numbers=tuple(range(1, 65)))
+    beside = replace(found, u=found.u + 1100 * (chip % 8), v=found.v + 900 * (chip // 8))
+    assert doubts(beside) == []
+    [text] = doubts(replace(beside, u=5 * found.u, v=5 * found.v))
+    assert "span 5 times what pixels say" in text
+
+
 # -- errors and dates -----------------------------------------------------------------------------
 
 

@@ -237,3 +237,18 @@ def test_an_exposure_with_other_errors_is_named(rng):
         assert check.level == ("warn" if factor > 1 else "pass")
         assert ("(e04)" in check.sentence) == (factor > 1)
     assert not list(exposure_checks(None))
+
+
+def test_many_exposures_of_few_stars_do_not_deviate_by_chance(rng):
+    """Of 400 exposures of 20 stars some are always three standard deviations away."""
+    n_named, codes = 0, np.repeat(np.arange(400), 20)
+    x, used = np.arange(1.0, codes.size + 1), np.ones(codes.size, bool)
+    table = Matches(x, x, x, x, exposure=codes, exposure_names=tuple(map(str, range(400))))
+    for _ in range(50):
+        residual = rng.standard_normal((codes.size, 2))
+        found = StarSample(table, residual, used, x.size, np.ones((x.size, 2))).by_exposure
+        n_named += found.deviating.any()
+        residual[codes == 7] *= 3.0
+        found = StarSample(table, residual, used, x.size, np.ones((x.size, 2))).by_exposure
+        assert found.deviating[7]
+    assert n_named <= 2

@@ -14,6 +14,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import gammainc, gammaincc
 
 from bayesdist.data.magnitude_errors import MagnitudeErrors, estimate
 from bayesdist.data.matches import Matches
@@ -33,6 +34,7 @@ from bayesdist.utils.limits import EXPOSURE_CHI2
 
 SAMPLE = 200_000  # number of stars that represent all of them
 MIN_STARS = 50  # smallest number for an estimate of the scatter by magnitude
+DEVIATING = 0.0027  # probability of naming any exposure by chance: three standard deviations
 CERTAIN = 0.5  # probability of being a false match at which a star is excluded
 Bins = tuple[int, int]
 
@@ -66,10 +68,15 @@ class ExposureScatter:
 
     @property
     def deviating(self) -> Bool:
-        """Boolean mask (E,) of exposures whose errors differ significantly from those of all."""
+        """Boolean mask (E,) of exposures whose errors differ significantly from those of all.
+
+        For Gaussian residuals 2 n `relative` is distributed as chi-square with 2 n degrees of
+        freedom. The significance is divided by the number of exposures (Bonferroni).
+        """
         factor = np.maximum(self.relative, 1.0 / self.relative)
-        by_chance = np.abs(self.relative - 1.0) <= 3.0 * self.chance
-        return ~by_chance & (factor > EXPOSURE_CHI2.value)
+        n, half = self.n, self.n * self.relative
+        p_value = 2.0 * np.minimum(gammainc(n, half), gammaincc(n, half))
+        return (p_value < DEVIATING / n.size) & (factor > EXPOSURE_CHI2.value)
 
 
 @dataclass(frozen=True, eq=False)

@@ -63,10 +63,16 @@ def _doubts(stars: Matches, model: DistortionModel, scale_mas: float | None) -> 
 
 
 def _scale(stars: Matches) -> float | None:
-    """Units of u and v per pixel, from the spread of both; None if all stars coincide."""
-    pixels = float(np.hypot(np.std(stars.x), np.std(stars.y)))
-    plane = float(np.hypot(np.std(stars.u), np.std(stars.v)))
+    """Units of u and v per pixel, from the spread of both on each chip; None if stars coincide."""
+    pixels = float(np.hypot(_spread(stars, stars.x), _spread(stars, stars.y)))
+    plane = float(np.hypot(_spread(stars, stars.u), _spread(stars, stars.v)))
     return plane / pixels if pixels > 0 and plane > 0 else None
+
+
+def _spread(stars: Matches, values: Float) -> float:
+    """Standard deviation about the mean of each chip, since chips are side by side in u and v."""
+    n = np.maximum(np.bincount(stars.chip), 1)
+    return float(np.std(values - (np.bincount(stars.chip, values) / n)[stars.chip]))
 
 
 def _doubts_on_scale(
