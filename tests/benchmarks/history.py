@@ -35,6 +35,10 @@ def ratios_of(bench: dict[str, Any]) -> dict[str, float]:
             found[f"kernel, fraction of its roofline, order {r['order']}"] = (
                 r["floor_1"] / r["ns_1"]
             )
+            if "ns_rho" in r:
+                found[f"kernel, without / with correlations, order {r['order']}"] = (
+                    r["ns_1"] / r["ns_rho"]
+                )
     for r in parts.get("linear", {}).get("rows", ()):
         if r["astropy_close"]:
             name = f"seconds, astropy / fit_linear, order {r['order']}, {r['n_stars']:,} stars"

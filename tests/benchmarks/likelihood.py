@@ -78,7 +78,10 @@ def run(sizes: Sizes) -> dict[str, Any]:
 
 
 def _nanoseconds(order: int, n: int, sizes: Sizes) -> dict[str, float]:
-    """Nanoseconds for one star: of an evaluation by threads, of numpy's, and of an expansion."""
+    """Nanoseconds for one star: of an evaluation by threads, of numpy's, and of an expansion.
+
+    `ns_rho` is that of an evaluation by one thread with errors correlated between u and v.
+    """
     problem = simulated(n, order)
     spread = np.random.default_rng(0).standard_normal((sizes.batch, problem.dim))
     psi = problem.truth + SPREAD * spread
@@ -96,6 +99,8 @@ def _nanoseconds(order: int, n: int, sizes: Sizes) -> dict[str, float]:
                 timed(f"ns_{count}", call, sizes.batch)
                 found[f"ns_{count}"] /= sizes.batch
     with Threads(1):
+        timed("ns_rho", kernel_call(problem.with_correlations, psi), sizes.batch)
+        found["ns_rho"] /= sizes.batch
         timed("ns_expansion", lambda: problem.target.expand(psi[0]), 10)
     if 8e-6 * n * (order + 1) ** 2 <= sizes.design_mb:
         plain = PlainDensity(problem)

@@ -177,7 +177,9 @@ def _kernel(part: dict[str, Any]) -> list[str]:
         "",
         f"Nanoseconds for one star and evaluation of the log-likelihood, {rows[0]['batch']} "
         "parameter vectors at once. numpy: one parameter vector, design matrix stored, BLAS as it "
-        "comes. *Expansion*: value, gradient and Hessian at one parameter vector, 1 thread. "
+        "comes. *With rho*: errors correlated between u and v, relative to 1 thread without them, "
+        "at most 1.35. "
+        "*Expansion*: value, gradient and Hessian at one parameter vector, 1 thread. "
         "Measured ceilings: "
         f"{roof['fma_per_ns']:.1f} multiply-adds per ns and core in the cache, "
         f"{roof['bytes_per_ns']:.1f} GB/s (triad). The roofline is the largest of: "
@@ -188,7 +190,7 @@ def _kernel(part: dict[str, Any]) -> list[str]:
     head = ["order", "N"]
     for k in counts:
         head += [f"{k} thread{'s' * (k > 1)}", "roofline", "reached"]
-    head += ["numpy", "numpy / 1 thread", "expansion"]
+    head += ["with rho / 1 thread", "numpy", "numpy / 1 thread", "expansion"]
     body = []
     for r in rows:
         cells = [str(r["order"]), f"{r['n_stars']:,}"]
@@ -198,7 +200,8 @@ def _kernel(part: dict[str, Any]) -> list[str]:
             cells += [_number(mine), _number(floor), share]
         numpy_ns, one = r.get("ns_numpy"), r.get("ns_1")
         times = None if numpy_ns is None or one is None else numpy_ns / one
-        body.append([*cells, *map(_number, (numpy_ns, times, r.get("ns_expansion")))])
+        rho = None if one is None or "ns_rho" not in r else r["ns_rho"] / one
+        body.append([*cells, *map(_number, (rho, numpy_ns, times, r.get("ns_expansion")))])
     return out + _table(head, body)
 
 

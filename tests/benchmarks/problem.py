@@ -7,7 +7,7 @@ answered here.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -89,6 +89,12 @@ class Problem:
 
     def __len__(self) -> int:
         return len(self.matches)
+
+    @property
+    def with_correlations(self) -> Problem:
+        """The same with errors that are correlated between u and v, of all shapes."""
+        rho = np.random.default_rng(46).uniform(-0.9, 0.9, len(self))
+        return replace(self, matches=self.matches.with_columns(rho_uv=rho))
 
     @property
     def dim(self) -> int:
