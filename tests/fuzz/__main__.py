@@ -14,7 +14,7 @@ from pathlib import Path
 from tests.fuzz.cases import drawn, kept
 from tests.fuzz.inputs import inputs
 from tests.fuzz.mutation import MUTATIONS
-from tests.fuzz.verdicts import table_of, tried
+from tests.fuzz.verdicts import not_taken, table_of, tried
 
 BEGUN = 1000  # cases, from which on runs are begun for them
 SHORT = 100  # cases: with fewer, one of those that failed once is tried for each mutation
@@ -33,6 +33,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with tempfile.TemporaryDirectory(prefix="bayesdist-fuzz-") as folder:
         made = inputs(Path(folder), begun=given.cases >= BEGUN or bool(given.only))
         known = [one for one in made if given.only in f"{one.kind} {one.name}"]
+        refused = list(not_taken(known)) if given.cases >= BEGUN and not given.kept else []
+        print(*refused, sep="\n", file=sys.stderr, flush=True)
         cases = kept()
         if given.cases < SHORT and not given.kept:
             cases = list({case.mutation: case for case in cases}.values())
@@ -56,8 +58,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Path(given.failed).write_text("".join(f"{v.case.line}\n" for v in failed), "utf-8")
     if given.json:
         found = {"table": table, "tried": len(verdicts), "failed": [v.told for v in failed]}
+        found["refused undamaged"] = refused
         Path(given.json).write_text(json.dumps(found), "utf-8")
-    return 1 if failed else 0
+    return 1 if failed or refused else 0
 
 
 if __name__ == "__main__":

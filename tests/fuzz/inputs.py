@@ -128,10 +128,11 @@ def _stars(folder: Path, run: Path) -> Iterator[Input]:
         commands = CHECK | {
             "init": ["init", "@/new.toml", "--matches", f"@/{name}"],
             "apply": ["apply", str(run / "sip.hdr"), f"@/{name}", "-o", "@/out.csv", "--chip", "1"],
-            "monitor": ["monitor", str(run), f"@/{name}"],
             "select-order": ["select-order", "@/config.toml", "--orders", "1", "2"],
             "fit": ["stage", "fit", "@", "-q"],
         }
+        if "unit" not in data:  # monitor takes it from the table
+            commands["monitor"] = ["monitor", str(run), f"@/{name}"]
         yield Input(name, "stars", here, name, commands)
     here = folder / "hst1pass"
     here.mkdir()
@@ -160,7 +161,7 @@ def _star_lists(folder: Path) -> Iterator[Input]:
         yield Input(f"campaign-{Path(name).name}", "star lists", here, name, commands)
     field_ = small()
     here = folder / "selfcal"
-    write_selfcal(here, list_table(field_), selfcal={"commanded": "commanded.ecsv"})
+    write_selfcal(here, list_table(field_), gauge={"offsets": "commanded.ecsv"})
     commanded(field_, 1.0, np.random.default_rng(1)).write(here / "commanded.ecsv")
     for name in ("lists.ecsv", "commanded.ecsv"):
         yield Input(f"selfcal-{name}", "star lists", here, name, CHECK)
@@ -227,6 +228,9 @@ def _settings(folder: Path, run: Path) -> Iterator[Input]:
 # -- products -------------------------------------------------------------------------------------
 
 
+OF_STATED_SIZE = ("parameters", "idctab", "stdgdc", "wise_meta", "jwst", "roman")
+
+
 def _products(folder: Path) -> Iterator[Input]:
     for key, settings in SETTINGS.items():
         here = folder / key
@@ -240,12 +244,12 @@ def _products(folder: Path) -> Iterator[Input]:
         for one in files:
             shutil.copy(here / one.file_name, here / "whole" / one.file_name)
         (here / "stars.csv").write_text("x,y\n500,400\n600,500\n7,9\n")
-        size = ["--size", "1200", "900"]
+        size = [] if key in OF_STATED_SIZE else ["--size", "1200", "900"]
         commands = {
             "inspect": ["inspect", f"@/{main}"],
             "compare": ["compare", f"@/{main}", f"@/whole/{main}", *size, "--grid", "9", "9"],
             "apply": ["apply", f"@/{main}", "@/stars.csv", "-o", "@/out.csv", *size],
-            "convert": ["convert", f"@/{main}", "--to", "tpv", "-o", "@/converted", *size],
+            "convert": ["convert", f"@/{main}", "--to", "parameters", "-o", "@/converted", *size],
         }
         if key in ("sip", "wise_meta"):
             commands["rotate"] = ["wise", "rotate", f"@/{main}", "-o", "@/out.txt"]
@@ -320,7 +324,6 @@ def _of_run(run: Path, folder: Path) -> Iterator[Input]:
         "report": ["stage", "report", "@/run", "-q"],
         "evaluate": ["stage", "evaluate", "@/run", "-q"],
         "export": ["stage", "export", "@/run", "-q"],
-        "release": ["release", "@/run", "-o", "@/released"],
     }
     names = ("run.json", "summary.json", "config.toml", "posterior.nc", "fit.nc", "diagnostics.h5",
              "evaluation.h5", "budget.ecsv", "margins.ecsv", "coefficients.ecsv",
@@ -341,7 +344,6 @@ def _begun_runs(folder: Path) -> Iterator[Input]:
     commands = {
         "fit": ["stage", "fit", "@/run", "-q"],
         "match": ["stage", "match", "@/run", "-q"],
-        "inspect": ["inspect", "@/run"],
     }
     for name in ("run.json", "detections.h5", "solution.h5", "fit.nc", "gauge.ecsv",
                  "matching.ecsv", "fit.h5"):  # fmt: skip

@@ -78,6 +78,16 @@ def tried(inputs: Sequence[Input], cases: Iterable[Case]) -> Iterator[Verdict]:
         yield Verdict(c, one.kind, end, answer)
 
 
+def not_taken(inputs: Sequence[Input]) -> Iterator[str]:
+    """Commands that refuse an input that is not damaged, so that no damage to it is tried."""
+    plain = PlainAnswers()
+    for one in inputs:
+        for command in one.commands:
+            answer = plain.of(one, command)
+            if answer.end != "returned" or answer.code in (*REFUSED, DEFECT, NO_MEMORY):
+                yield f"{one.name}, {command}: {answer.err.strip()}"
+
+
 def not_accepted(answer: Answer) -> str:
     """Key of TITLES, where a command did not take its input; '' where it did."""
     if answer.end in ("hang", "memory"):
