@@ -51,8 +51,6 @@ class Mission:
     # further checks of files, by the key of their format, which defines the arguments: for "sip" a
     # `bayesdist.formats.sip.lint.Explanation`
     checks: Mapping[str, str] = field(default_factory=dict)
-    # module that registers figures and tables with `bayesdist.report.contents.REPORT`
-    report: str = ""
 
 
 @dataclass(frozen=True)
@@ -72,12 +70,15 @@ class Plugin:
     commands : mapping of str to str
         Commands at the top level, like those of the core, for kinds of runs that have some; each
         object is a `click.Command`.
+    reports : tuple of str
+        Modules that register figures, tables and sections with `bayesdist.report.contents.REPORT`.
     """
 
     kinds: Mapping[str, str] = field(default_factory=dict)
     formats: Mapping[str, str] = field(default_factory=dict)
     missions: Mapping[str, Mission] = field(default_factory=dict)
     commands: Mapping[str, str] = field(default_factory=dict)
+    reports: tuple[str, ...] = ()
 
 
 @cache
@@ -138,10 +139,10 @@ def mission_objects(
 
 
 def import_reports() -> None:
-    """Import the modules of missions that register figures and tables of the report."""
-    for name, mission in missions().items():
-        if mission.report:
-            _attempt(name, mission.report, partial(import_module, mission.report))
+    """Import the modules of plugins that register figures and tables of the report."""
+    for name, plugin in plugins().items():
+        for module in plugin.reports:
+            _attempt(name, module, partial(import_module, module))
 
 
 def load_object(where: str) -> Any:

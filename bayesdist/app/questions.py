@@ -12,7 +12,6 @@ import numpy as np
 from astropy.table import Table
 
 from bayesdist.app.products.made_files import product_of_run, with_facts_of_run
-from bayesdist.app.report import title_of
 from bayesdist.app.run import Positions, Run
 from bayesdist.assess import ErrorBudget, Margin, UncertaintyMap
 from bayesdist.assess.budget import budget_of, place_budget
@@ -184,7 +183,7 @@ def _summary(run: Run) -> RunSummary:
     exposures = len(run.placed.exposures)
     state = f"yes, R-hat {convergence.rhat_max:.3f}, ESS {convergence.ess_bulk_min:.0f}"
     facts = [
-        (run.kind.rows.capitalize(), f"{fit.n_rows}, {fit.n_used} used in the fit"),
+        (run.kind.words.rows.capitalize(), f"{fit.n_rows}, {fit.n_used} used in the fit"),
         ("Exposures", str(exposures)),
         ("Model", f"order {fit.model.order}, {fit.model.n_params} parameters"),
         ("Converged", state if run.converged else f"NO: {'; '.join(convergence.reasons)}"),
@@ -200,7 +199,7 @@ def _summary(run: Run) -> RunSummary:
         if m.verdict == "not shown"
     ]
     return RunSummary(
-        title=title_of(config) or "calibration",
+        title=config.detector_title or "calibration",
         verdict_level=_level(run),
         headline=_headline(run),
         warnings=(*run.warnings, *not_shown),

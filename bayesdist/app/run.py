@@ -17,6 +17,7 @@ from bayesdist.app import hooks
 from bayesdist.app.artefacts.parts import NO_TABLES, Part, StoredLookupTables
 from bayesdist.app.artefacts.stars import QUOTED, ErrorLaw, RunInput, StarReader
 from bayesdist.app.python_terms import python_terms
+from bayesdist.app.store import as_json
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.tables.result_files import load_diagnostics, load_evaluation
 from bayesdist.assess import ErrorBudget, Margin, Requirement, UncertaintyMap
@@ -47,6 +48,7 @@ if TYPE_CHECKING:
 
     from bayesdist.app.config import Config
     from bayesdist.app.kinds.kind import RunKind
+    from bayesdist.assess.comparison.compare import Comparison
     from bayesdist.calibration.wcs import CalibrationWCS
     from bayesdist.report.run_plots import RunPlots
 
@@ -74,6 +76,10 @@ STAGES: Mapping[str, tuple[str, ...]] = {
     "export": ("products",),
     "report": ("figures",),
 }
+# artefacts and what was derived from them that pickled runs keep if they have been used
+PROVENANCE = ("command", "created", "seed", "inputs", "versions")  # facts of run.json
+RESULTS = ("posterior", "diagnostics", "evaluation")
+DERIVED = ("solution", "previous", "report_data")
 ORDER = {name: place for place, names in enumerate(STAGES.values()) for name in names}
 
 
@@ -546,6 +552,20 @@ class Run:
         vars(run)["config"] = config
         return run
 
+    def __reduce__(self) -> tuple[Callable[..., Run], tuple[object, ...]]:
+        """Pickle the results of a run; its stars and inputs are read again from its folder.
+
+        A run in memory is pickled with its stars.
+        """
+        if self.directory.in_memory:
+            return _unpickled, (self.directory, self.source, dict(self.made), {})
+        loaded = {name: vars(self)[name] for name in RESULTS if name in vars(self)}
+        made = {**self.made, **vars(self).get("_fitted", {}), **loaded}
+        read_again = {*STAGES["read"], *STAGES["match"]}
+        made = {name: value for name, value in made.items() if name not in read_again}
+        derived = {name: vars(self)[name] for name in DERIVED if name in vars(self)}
+        return _unpickled, (self.directory, None, made, derived)
+
     def _artefact(self, name: str, stage: str, load: Callable[[], T]) -> T:
         """Artefact made by this process, otherwise loaded from the folder if undamaged."""
         if self.made.get(name) is not None:
@@ -808,6 +828,50 @@ class Run:
             return self.config.assess.epoch  # without reading the stars
         return max((self.last_epoch, *self.config.products.useafter_years()))
 
+    # -- report -----------------------------------------------------------------------------------
+
+    @property
+    def title(self) -> str:
+        """Name of the calibration: its detector, or else its folder."""
+        return self.config.detector_title or self.directory.path.resolve().name
+
+    @cached_property
+    def configuration(self) -> Mapping[str, Any]:
+        """Resolved configuration as in JSON, by section."""
+        configuration: Mapping[str, Any] = as_json(self.config.model_dump(exclude_none=True))
+        return configuration
+
+    @property
+    def held_parameters(self) -> frozenset[str]:
+        """Names of the parameters that a prior or the gauge alone constrains."""
+        return self.kind.held_parameters(self)
+
+    @cached_property
+    def previous(self) -> tuple[Comparison, ...]:
+        """Difference from the release that the run replaces, by chip; empty if none is named."""
+        previous: tuple[Comparison, ...] = load_object(hooks.PREVIOUS)(self)
+        return previous
+
+    @cached_property
+    def report_data(self) -> Any:
+        """What the figures of this kind of run draw in addition; None if there is nothing."""
+        return self.kind.report_data(self)
+
+    @property
+    def summary(self) -> Mapping[str, Any]:
+        """Sections of summary.json."""
+        return self.directory.summary
+
+    @property
+    def provenance(self) -> Mapping[str, Any]:
+        """Folder, command, start, seed, inputs, versions and stages of the run."""
+        facts = self.directory.facts
+        return {
+            "folder": self.directory.path.resolve().name,
+            **{name: facts[name] for name in PROVENANCE},
+            "stages": self.directory.record.stages,
+        }
+
     @property
     def source_name(self) -> str:
         """Name of the run in its products; empty if it has no folder."""
@@ -824,3 +888,17 @@ class Run:
         """All checks except those of an evaluation."""
         checks: tuple[Check, ...] = load_object(hooks.CHECKS)(self)
         return checks
+
+
+def _unpickled(
+    directory: RunDirectory,
+    source: RunInput | None,
+    made: Mapping[str, Any],
+    derived: Mapping[str, Any],
+) -> Run:
+    """Run that was pickled; without a source it is the run of its folder."""
+    run = replace(Run.of(directory), made=made)
+    if source is not None:
+        run = replace(run, source=source)
+    vars(run).update(derived)
+    return run

@@ -54,7 +54,7 @@ def save_fit(run: Run) -> None:
     artefacts = {name: getattr(run, name) for name in FIT_ARTEFACTS}
     write_stored_fit(run.directory.path, **artefacts)
     run.directory.summarise(**fit_sections(run))
-    log_fit(run.fit, run.kind.rows)
+    log_fit(run.fit, run.kind.words.rows)
     _log_geometry(run.fit)
     if run.kind.rehearses_fit:
         rehearse_solution(run)

@@ -11,9 +11,13 @@ from matplotlib.figure import Figure
 
 from bayesdist.report.figures.style import figure_style
 
+T = TypeVar("T")
 Make = TypeVar("Make", bound=Callable[..., Any])
 Kind = Literal["figure", "table", "data"]
 When = Callable[[Any], bool]
+
+
+_ANY = ("report", "Figures")  # documentation of sections that name no other page
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +39,9 @@ class Section:
     empty: str = ""  # text shown instead of missing tables; without it the section is left out
     parent: str = ""  # name of the section that contains this one
     printed: bool | When = True
+    when: When | None = None  # condition on the results for all entries of the section
+    explained: tuple[str, str] = _ANY  # page of the documentation that explains it, and its heading
+    groups: tuple[str, ...] = ()  # groups of the status table whose details are in the section
 
     def title_of(self, results: Any) -> str:
         """Title for a page with these results."""
@@ -127,6 +134,11 @@ class Registry:
 
         return register
 
+    def insert(self, after: str, *sections: Section) -> None:
+        """Add sections after the one with the given name."""
+        place = [section.name for section in self.sections].index(after) + 1
+        self.sections = (*self.sections[:place], *sections, *self.sections[place:])
+
     @property
     def entries(self) -> tuple[Entry, ...]:
         """Entries in the order of the sections, then of registration."""
@@ -136,8 +148,9 @@ class Registry:
     def items(self, results: Any, kind: Kind) -> tuple[Item, ...]:
         """Items that can be made from these results, in the order of the page."""
         out = []
+        absent = {s.name for s in self.sections if s.when is not None and not s.when(results)}
         for entry in self.entries:
-            if entry.kind != kind or not entry.applies(results):
+            if entry.kind != kind or entry.section in absent or not entry.applies(results):
                 continue
             printed = entry.printed(results) if callable(entry.printed) else entry.printed
             if entry.each is None:
@@ -159,94 +172,89 @@ def _present(results: Any, path: str) -> bool:
     return value is not None and (not isinstance(value, tuple | Mapping) or bool(value))
 
 
+def needed(value: T | None) -> T:
+    """Value that is not None because the registry has checked `needs` of the entry."""
+    if value is None:
+        raise LookupError("a figure is drawn without what it needs")
+    return value
+
+
 REPORT = Registry(
     "report",
     (
-        Section("status", "Status"),
-        Section("holdout", "Held-out stars"),
-        # in a campaign, the section on matching describes the data
-        Section("data", "Data", printed=lambda r: r.words.prints_data),
-        Section("campaign", "Campaign"),
-        Section("campaign-matching", "Catalogue and matching", parent="campaign"),
-        Section("campaign-tables", "Look-up tables", parent="campaign"),
-        Section("campaign-time", "Linear terms against time", parent="campaign"),
+        Section("status", "Status", explained=("report", "Summary")),
         Section(
-            "campaign-release",
-            "Released files and the alignment of two exposures",
-            parent="campaign",
-            printed=False,  # these products are in files
+            "holdout",
+            "Held-out stars",
+            explained=("method", "Held-out stars"),
+            groups=("Held-out truth",),
         ),
-        Section("selfcal", "Gauge and stars"),
-        Section("fit", lambda r: r.words.fit_title),
-        Section("residuals", "Residuals"),
+        Section(
+            "data",
+            "Data",
+            printed=lambda run: run.kind.words.prints_data,
+            explained=("your_table", ""),
+            groups=("Matching",),
+        ),
+        Section(
+            "fit",
+            lambda run: run.kind.words.fit_title,
+            explained=("method", "Linear fit"),
+            groups=("Score tests", "Fit"),
+        ),
+        Section("residuals", "Residuals", explained=("method", "Tests for what a model lacks")),
         Section(
             "outliers",
             "Outliers",
             printed=False,
-            empty="Nothing was sampled: the fit rejects outliers by its limits and does not model"
-            " them.",
+            explained=("concepts", "Jitter and membership"),
+            groups=("Sampling",),
         ),
-        Section("coefficients", "Coefficients"),
-        Section("maps", "Distortion and its uncertainty over the detector"),
-        Section("previous", "Difference from the previous release"),
-        Section("periods", "Time variation"),
-        Section("budget", "Error budget", empty="No error budget was made."),
-        Section("margins", "Margins", empty="No requirement was stated."),
-        Section("products", "Products", empty="No product was written."),
-        Section("provenance", "Provenance"),
+        Section("coefficients", "Coefficients", explained=("method", "Model")),
+        Section(
+            "maps",
+            "Distortion and its uncertainty over the detector",
+            explained=("concepts", "What 68 % means"),
+        ),
+        Section(
+            "previous",
+            "Difference from the previous release",
+            explained=("report", "Difference from the previous release"),
+        ),
+        Section("periods", "Time variation", explained=("wise", ""), groups=("Periods",)),
+        Section(
+            "budget",
+            "Error budget",
+            explained=("method", "Error budget and margins"),
+            groups=("Errors", "Assumptions"),
+        ),
+        Section(
+            "margins",
+            "Margins",
+            empty="No requirement was stated.",
+            explained=("method", "What a verdict rests on"),
+            groups=("Requirements", "Validity"),
+        ),
+        Section(
+            "products",
+            "Products",
+            empty="No product was written.",
+            explained=("files", ""),
+            groups=("Products",),
+        ),
+        Section("provenance", "Provenance", explained=("files", "")),
     ),
 )
 
 
-# documentation page and heading that explain a section of the report
-EXPLAINED = {
-    "status": ("report", "Summary"),
-    "data": ("your_table", ""),
-    "campaign": ("campaign", ""),
-    "campaign-matching": ("campaign", "The catalogue"),
-    "campaign-tables": ("campaign", ""),
-    "campaign-time": ("campaign", ""),
-    "campaign-release": ("campaign", ""),
-    "selfcal": ("self_calibration", ""),
-    "fit": ("method", "Linear fit"),
-    "residuals": ("method", "Tests for what a model lacks"),
-    "outliers": ("concepts", "Jitter and membership"),
-    "coefficients": ("method", "Model"),
-    "maps": ("concepts", "What 68 % means"),
-    "previous": ("report", "Difference from the previous release"),
-    "periods": ("wise", ""),
-    "budget": ("method", "Error budget and margins"),
-    "margins": ("method", "What a verdict rests on"),
-    "holdout": ("method", "Held-out stars"),
-    "products": ("files", ""),
-    "provenance": ("files", ""),
-}
-_ANY = ("report", "Figures")  # for pages other than the report of a run
-
-# section of the report with the details of a group of the status table
-_SECTIONS = {
-    "Held-out truth": "holdout",
-    "Campaign": "campaign",
-    "Gauge": "selfcal",
-    "Sampling": "outliers",
-    "Score tests": "fit",
-    "Fit": "fit",
-    "Matching": "data",
-    "Errors": "budget",
-    "Assumptions": "budget",
-    "Periods": "periods",
-    "Requirements": "margins",
-    "Validity": "margins",
-    "Products": "products",
-}
-
-
 def explanation_of(section: str) -> str:
     """Command that shows the documentation of a section, and the heading to look for."""
-    page, heading = EXPLAINED.get(section, _ANY)
+    of_section = {known.name: known.explained for known in REPORT.sections}
+    page, heading = of_section.get(section, _ANY)
     return f"bayesdist docs {page}" + (f", “{heading}”" if heading else "")
 
 
 def section_of(group: str) -> str:
     """Section of the report for a group of the status table; the group itself if there is none."""
-    return _SECTIONS.get(group, group)
+    names = {of: section.name for section in REPORT.sections for of in section.groups}
+    return names.get(group, group)

@@ -4,74 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from bayesdist.errors import InputError, require_known, required
 from bayesdist.report import plots
+from bayesdist.report.run import ReportedRun
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure, SubFigure
     from numpy.typing import NDArray
 
-    from bayesdist.assess.evaluation import Evaluation
-    from bayesdist.data import MagnitudeErrors
-    from bayesdist.diagnose.diagnostics import Diagnostics
-    from bayesdist.infer import LinearFit, Posterior
-    from bayesdist.infer.solution.solution import Solution
 
 __all__ = ["RunPlots"]
 
 RESIDUAL_KINDS = ("position", "histogram", "magnitude", "x", "y", "colour", "epoch")
 MAPS = ("posterior", "formal", "relative")
-
-
-class WithMagnitudeErrors(Protocol):
-    """Errors that a fit assumed."""
-
-    @property
-    def by_magnitude(self) -> MagnitudeErrors | None:
-        """Errors by magnitude that were assigned to the stars; None if there are none."""
-
-
-class WithRows(Protocol):
-    """Kind of a run."""
-
-    @property
-    def rows(self) -> str:
-        """Word for the rows of the data in labels, such as 'stars' or 'detections'."""
-
-
-class PlottedRun(Protocol):
-    """What the plots read of a run; `bayesdist.Run` has more."""
-
-    @property
-    def fit(self) -> LinearFit:
-        """Least-squares fit."""
-
-    @property
-    def posterior(self) -> Posterior:
-        """Posterior as it was sampled."""
-
-    @property
-    def solution(self) -> Solution:
-        """Solution with the distortion to show."""
-
-    @property
-    def diagnostics(self) -> Diagnostics:
-        """Results of the tests of the residuals."""
-
-    @property
-    def evaluation(self) -> Evaluation:
-        """Maps, budget, margins and validity periods."""
-
-    @property
-    def errors(self) -> WithMagnitudeErrors:
-        """Errors that the fit assumed."""
-
-    @property
-    def kind(self) -> WithRows:
-        """Kind of the run."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -80,11 +28,11 @@ class RunPlots:
 
     Parameters
     ----------
-    run : PlottedRun
+    run : ReportedRun
         Run that was sampled; its artefacts are read when a plot needs them.
     """
 
-    run: PlottedRun
+    run: ReportedRun
 
     def __dir__(self) -> list[str]:
         """Names of the plots only, for completion in notebooks."""
@@ -219,7 +167,7 @@ class RunPlots:
         """
         require_known(kind, RESIDUAL_KINDS, "kind of residuals", where="kind")
         run = self.run
-        sample, unit, rows = run.diagnostics.sample, run.fit.model.unit, run.kind.rows
+        sample, unit, rows = run.diagnostics.sample, run.fit.model.unit, run.kind.words.rows
         if kind == "position":
             binned = run.diagnostics.shown[self._index(chip)].residuals()
             options = {"unit": unit, "name": self._name(chip)} | options

@@ -11,9 +11,9 @@ from typing import Any
 from markupsafe import Markup
 
 from bayesdist.files.atomic import atomic_path
-from bayesdist.report.context import ReportInput
 from bayesdist.report.drawing import Drawing, draw_all
 from bayesdist.report.page import Part, Picture, numbered, parts_of, template
+from bayesdist.report.run import ReportedRun, is_provisional, is_simulated
 from bayesdist.report.sections import REPORT
 from bayesdist.report.sections.run.status import facts_line, verdict
 from bayesdist.report.texttable import moment
@@ -40,21 +40,21 @@ _PRINT_WORDS = (
 )
 
 
-def draw_report(r: ReportInput, *, pdf: bool = False, processes: int = 1) -> dict[str, Drawing]:
+def draw_report(run: ReportedRun, *, pdf: bool = False, processes: int = 1) -> dict[str, Drawing]:
     """Draw the figures of the report of a run, by name in its order; `pdf`: also as PDF."""
-    return draw_all(REPORT, r, pdf=pdf, processes=processes)
+    return draw_all(REPORT, run, pdf=pdf, processes=processes)
 
 
-def render_report(r: ReportInput, drawings: Mapping[str, Drawing]) -> str:
+def render_report(run: ReportedRun, drawings: Mapping[str, Drawing]) -> str:
     """Report as a complete, self-contained HTML document.
 
     Its script computes from numbers embedded in the page; without scripts all tables and figures
     are shown.
     """
-    data = {item.name: _embedded(item.made(r)) for item in REPORT.items(r, "data")}
+    data = {item.name: _embedded(item.made(run)) for item in REPORT.items(run, "data")}
     return template("report.html.jinja").render(
-        **_with_strip(_contents(r, drawings)),
-        trace=f"{r.name} · {_maker(r)}",
+        **_with_strip(_contents(run, drawings)),
+        trace=f"{run.title} · {_maker(run)}",
         budget_words=_BUDGET_WORDS,
         print_words=f"{_PRINT_WORDS} {_FOOTER}",
         data=data,
@@ -68,10 +68,10 @@ def _embedded(data: Any) -> Markup:
 
 
 def write_report(
-    path: str | os.PathLike[str], r: ReportInput, drawings: Mapping[str, Drawing]
+    path: str | os.PathLike[str], run: ReportedRun, drawings: Mapping[str, Drawing]
 ) -> None:
     """Write the report as HTML; raises InputError if the file cannot be written."""
-    text = render_report(r, drawings)
+    text = render_report(run, drawings)
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
@@ -93,27 +93,30 @@ def _with_strip(contents: dict[str, Any]) -> dict[str, Any]:
     return contents | {"strip": strip, "status": status, "parts": remaining_pictures}
 
 
-def _contents(r: ReportInput, drawings: Mapping[str, Drawing]) -> dict[str, Any]:
+def _contents(run: ReportedRun, drawings: Mapping[str, Drawing]) -> dict[str, Any]:
     """Content of the page."""
-    parts = parts_of(REPORT, r, drawings)
+    parts = parts_of(REPORT, run, drawings)
     status = next(part for part in parts if part.name == "status")
     other_parts: list[Part] = [part for part in parts if part is not status]
     return {
-        "run": r,
+        "title": run.title,
+        "order": run.model.order,
+        "unit": run.model.unit,
+        "run": {"provisional": is_provisional(run), "simulated": is_simulated(run)},
         "status": status,
         "parts": other_parts,
         "provisional": _PROVISIONAL,
-        "footer": f"Made by {_maker(r)}. {_FOOTER}",
-        "chips": _chips(r),
-        "verdict": verdict(r),
-        "facts": facts_line(r),
+        "footer": f"Made by {_maker(run)}. {_FOOTER}",
+        "chips": _chips(run),
+        "verdict": verdict(run),
+        "facts": facts_line(run),
     }
 
 
-def _maker(r: ReportInput) -> str:
+def _maker(run: ReportedRun) -> str:
     """Version and time that identify the run of a printed copy, as far as they are known."""
-    versions = r.provenance.get("versions", {})
-    began = moment(r.provenance.get("created", ""))
+    versions = run.provenance.get("versions", {})
+    began = moment(run.provenance.get("created", ""))
     return " ".join(
         part
         for part in (
@@ -125,12 +128,12 @@ def _maker(r: ReportInput) -> str:
     )
 
 
-def _chips(r: ReportInput) -> str:
+def _chips(run: ReportedRun) -> str:
     """Names and sizes of the chips, grouped by size."""
     names: dict[str, list[str]] = {}
-    for c in r.chips:
-        size = "{:g} × {:g}".format(*c.chip.size)
-        names.setdefault(size, []).append(c.chip.name or f"chip {c.chip.number}")
+    for chip in run.model.chips:
+        size = "{:g} × {:g}".format(*chip.size)
+        names.setdefault(size, []).append(chip.name or f"chip {chip.number}")
 
     def listed(several: list[str]) -> str:
         if len(several) > MOST_NAMED:

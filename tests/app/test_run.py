@@ -25,7 +25,6 @@ from astropy.wcs import WCS, FITSFixedWarning
 import bayesdist
 from bayesdist.app.commands.on_runs.validate import exit_code
 from bayesdist.app.config import load_config, parse_config
-from bayesdist.app.report import title_of
 from bayesdist.app.screen import progress_bar
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.store.summary import Summary, schema_text
@@ -618,7 +617,7 @@ def test_max_steps_is_a_total(unconverged, finished):
     ],
 )
 def test_a_report_is_titled_by_what_was_calibrated(sections, title):
-    assert title_of(parse_config(config_text(**sections), "c.toml")) == title
+    assert parse_config(config_text(**sections), "c.toml").detector_title == title
 
 
 def test_the_report_says_which_folder_it_is_of(finished):

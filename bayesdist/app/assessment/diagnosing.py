@@ -70,8 +70,8 @@ def _from_residuals(run: Run, posterior: Posterior | None) -> Diagnostics:
         in_circle=in_circle(run.stars, config),
         matched_before=config.begins_with == "fit",
         error_scale=run.error_scale_sentence,
-        rows=kind.rows,
-        chooser=kind.chooser,
+        rows=kind.words.rows,
+        chooser=kind.words.rejection,
     )
     if config.field == WHOLE:
         return diagnostics

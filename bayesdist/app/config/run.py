@@ -57,6 +57,9 @@ FREE = "free"  # rates that are not taken from another run
 TABLES, POSTERIOR = "tables.h5", "posterior.nc"
 
 
+MOST_NAMED = 3  # largest number of chips named in a title
+
+
 class RunConfig(Section):
     """Sections of every configuration of a run; each kind adds further sections."""
 
@@ -147,6 +150,15 @@ class RunConfig(Section):
     def named_detector(self) -> str:
         """Name of the detector, for formats that are specific to one detector."""
         return self.detector.name
+
+    @property
+    def detector_title(self) -> str:
+        """Mission, instrument, detector or chips, and filter, as far as they are given."""
+        block, names = self.detector, [chip.name for chip in self.chip if chip.name]
+        is_short = len(names) <= MOST_NAMED
+        detector = block.name or (" and ".join(names) if is_short else f"{names[0]} to {names[-1]}")
+        named = " ".join(part for part in (block.mission, block.instrument, detector) if part)
+        return ", ".join(part for part in (named, self.filter_name) if part)
 
     @property
     def filter_name(self) -> str:

@@ -26,6 +26,7 @@ from bayesdist.infer.catalogue.star_errors import StarErrors
 from bayesdist.infer.exposures.hierarchy import Settling
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.model import DistortionModel, LookupTable
+from bayesdist.report.words import Terminology
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.checks import Check
 
@@ -76,8 +77,7 @@ class RunKind(ABC, Generic[C, I]):
     kind names itself in `kind` of its configuration.
     """
 
-    rows: ClassVar[str] = "stars"  # word for the rows of the data
-    chooser: ClassVar[str] = "least-squares fit"  # words for the step that rejects outlying rows
+    words: ClassVar[Terminology] = Terminology()  # words of messages and reports
     # True if the fit estimates the errors of centroids, which then include no other errors
     measures_centroids: ClassVar[bool] = True
     # frames of new exposures that are compared with a solution; None for those of the solution
@@ -204,9 +204,16 @@ class RunKind(ABC, Generic[C, I]):
         """Sections of summary.json about the evaluated solution."""
         return {}
 
-    def report_parts(self, run: Run) -> dict[str, Any]:
-        """Fields of the content of the report that only this kind has, by their names."""
-        return {}
+    def held_parameters(self, run: Run) -> frozenset[str]:
+        """Names of the parameters that a prior or the gauge alone constrains."""
+        return frozenset()
+
+    def report_data(self, run: Run) -> Any:
+        """What the figures of this kind draw in addition to the artefacts of a run.
+
+        Processes that draw receive it instead of the inputs.
+        """
+        return None
 
     def further_exposures(self, run: Run) -> FurtherExposures:
         """Exposures that requirements may need in addition to those of a run."""

@@ -22,7 +22,7 @@ from bayesdist.assess.terms.parameters import ExposureVariation
 from bayesdist.data import Matches, ReferenceCatalog
 from bayesdist.diagnose.holdout.predictive import ExposureDeviations, Predictive, predictive_of
 from bayesdist.diagnose.overlap import OverlapTest
-from bayesdist.infer import Posterior
+from bayesdist.infer import GaussianPriors, LinearFit, Posterior
 from bayesdist.infer.catalogue.star_errors import StarErrors, StarInfluence, star_influence
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.kinds.campaign.checks import campaign_checks
@@ -44,18 +44,33 @@ from bayesdist.kinds.campaign.matched import (
 )
 from bayesdist.kinds.campaign.matching import campaign_lines, match_lists
 from bayesdist.kinds.campaign.parts import ExposureScatter
+from bayesdist.report.words import Terminology
 from bayesdist.utils.checks import Check
 
 if TYPE_CHECKING:
     from bayesdist.infer.compare.monitoring import NewFit
+    from bayesdist.kinds.campaign.report.data import CampaignData
 
+HELD_BY_PRIOR = 0.99  # ratio to the prior sigma above which the data determine nothing
+NEW_EXPOSURE = "a new exposure whose shift and rotation are fitted by its user"
 SAMPLING = 1  # number of the random stream of the stage 'sample', derived from the seed
 TOGETHER = 1.5  # node spacings over which errors of tables are correlated, from their covariance
+
+
+PAIRED = Terminology(
+    prints_data=False,
+    whom=f" for {NEW_EXPOSURE}",
+    new_exposure=f"For {NEW_EXPOSURE}: what a shift and a rotation of all chips together take up is"
+    " no error here.",
+    residuals=" These are the residuals of the joint fit, with all tables, in the cells of the test"
+    " for structure (see the status).",
+)
 
 
 class CampaignKind(RunKind[CampaignConfig, Inputs]):
     """Star lists, which are matched to a reference catalogue; exposures are fitted jointly."""
 
+    words = PAIRED
     section = "matching"
     along_detector = True
 
@@ -182,11 +197,19 @@ class CampaignKind(RunKind[CampaignConfig, Inputs]):
         """Linear terms as lines in time."""
         return line_sections(run.solution, run.config.chips()[0].number)
 
-    def report_parts(self, run: Run) -> dict[str, Any]:
-        """Catalogue, matching, tables and series, and the words of a campaign."""
-        from bayesdist.kinds.campaign.report import report_fields  # needed by one stage
+    def held_parameters(self, run: Run) -> frozenset[str]:
+        """Names of coefficients and rates that their prior determines rather than the data.
 
-        return report_fields(run)
+        Deviations of single exposures are not included, because their prior is the measured
+        scatter.
+        """
+        return held_by_prior(run.fit, run.priors)
+
+    def report_data(self, run: Run) -> CampaignData:
+        """Catalogue, matching, residuals without and with tables, and series."""
+        from bayesdist.kinds.campaign.report.data import data_of_campaign  # needed by one stage
+
+        return data_of_campaign(run)
 
     def fit_of_new_exposures(
         self, release: Run, new: Path
@@ -211,6 +234,16 @@ class CampaignKind(RunKind[CampaignConfig, Inputs]):
         """Filter of the exposures."""
         inputs: Inputs = run.inputs
         return inputs.filter
+
+
+def held_by_prior(fit: LinearFit, priors: GaussianPriors) -> frozenset[str]:
+    """Names of coefficients and rates that their prior determines rather than the data."""
+    share = fit.sigma * np.sqrt(priors.precision)
+    return frozenset(
+        p.name
+        for p, ratio in zip(fit.model.parameters, share, strict=True)
+        if p.kind != "frame" and ratio > HELD_BY_PRIOR
+    )
 
 
 def _reference_stars(run: Run) -> StarInfluence | None:

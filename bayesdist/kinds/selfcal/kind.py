@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from bayesdist.app.kinds.kind import EvaluationDomain, Outline, Questions, RunKind
 from bayesdist.app.run import Run
@@ -24,8 +24,33 @@ from bayesdist.kinds.selfcal.inputs import (
 from bayesdist.kinds.selfcal.matched import load_matched_selfcal
 from bayesdist.kinds.selfcal.matching import match_dithers, selfcal_lines
 from bayesdist.kinds.selfcal.solved import SelfCalibrated
+from bayesdist.report.words import Terminology
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.checks import Check
+
+if TYPE_CHECKING:
+    from bayesdist.kinds.selfcal.report import SelfcalData
+
+
+DETECTED = Terminology(
+    rows="detections",
+    all_rows="detections of stars",
+    false_rows="false detections",
+    rejection="limits of residuals",
+    fit="solution",
+    fit_title="Solution",
+    constraint="the gauge",
+    leverage=", less what the fitted stars take of them",
+    held="Held by the gauge, and therefore not shown: the detections say nothing of what these"
+    " parameters stand for",
+    with_shift=", in the gauge of the solution",
+    gauge_of_maps="What the gauge holds by convention, shift and rotation of the detector as a"
+    " whole among them unless something fixes them, has no error here.",
+    relative_map=" That of relative positions is the same in any gauge of shift, rotation and scale"
+    " (and skew, where all exposures have one roll angle); the other is that of the run's gauge.",
+    residuals=" Stars were fitted to these detections, so that fewer may do so than by chance; the"
+    " status has the test that allows for it.",
+)
 
 
 class SelfcalKind(RunKind[SelfcalConfig, Inputs]):
@@ -34,8 +59,7 @@ class SelfcalKind(RunKind[SelfcalConfig, Inputs]):
     section = "selfcal"
     has_catalogue = False
     along_detector = True
-    rows = "detections"
-    chooser = "limits of residuals"
+    words = DETECTED
     rehearses_fit = True
     new_frames = "affine"  # the orientation on the sky is unknown to a self-calibration
     no_order = (
@@ -142,11 +166,16 @@ class SelfcalKind(RunKind[SelfcalConfig, Inputs]):
             for text in texts
         )
 
-    def report_parts(self, run: Run) -> dict[str, Any]:
-        """Gauge and stars, and the words of a self-calibration."""
-        from bayesdist.kinds.selfcal.report import report_fields  # needed by one stage
+    def held_parameters(self, run: Run) -> frozenset[str]:
+        """Names of the parameters that the gauge alone constrains."""
+        names = run.model.names
+        return frozenset(names[k] for k in run.part(SelfCalibrated).gauge.held)
 
-        return report_fields(run)
+    def report_data(self, run: Run) -> SelfcalData:
+        """Gauge, stars and outlines of the exposures."""
+        from bayesdist.kinds.selfcal.report import data_of_selfcal  # needed by one stage
+
+        return data_of_selfcal(run)
 
 
 SELFCAL = SelfcalKind()

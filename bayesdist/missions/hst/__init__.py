@@ -15,7 +15,7 @@ PLUGIN = Plugin(
             simulate={"acs": f"{_COMMANDS}:simulate"},
             match_formats={"matchup": f"{_LISTS}:MATCHUP", "hst1pass": f"{_LISTS}:HST1PASS"},
             releases={"hst": "bayesdist.missions.hst.release:RELEASE"},
-            report="bayesdist.missions.hst.published",
         )
-    }
+    },
+    reports=("bayesdist.missions.hst.published",),
 )

@@ -12,9 +12,9 @@ from scipy.interpolate import PchipInterpolator
 from bayesdist.assess.budget_surface import JOINT, BudgetSurface, GridRow
 from bayesdist.assess.terms.forms import MEASURED, Row
 from bayesdist.assess.terms.given import CENTROID
-from bayesdist.report.contents import REPORT
-from bayesdist.report.context import ReportInput, needed
+from bayesdist.report.contents import REPORT, needed
 from bayesdist.report.figures.style import CYCLE, SEQUENTIAL
+from bayesdist.report.run import ReportedRun, mosaic_of, scale_mas, shown_maps
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.numbers import ladder
 
@@ -25,12 +25,12 @@ MOST_POINTS = 65  # along the longer side of a map; a pointer cannot resolve mor
 _COLORS = 12
 
 
-@REPORT.data(needs=("surface",))
-def budget_data(r: ReportInput) -> dict[str, Any]:
+@REPORT.data(needs=("evaluation.surface",))
+def budget_data(run: ReportedRun) -> dict[str, Any]:
     """Error budget as a function of position, epoch and magnitude."""
-    s = needed(r.surface)
+    s = needed(run.evaluation.surface)
     nodes = s.spans[0].nodes
-    return _common(r) | {
+    return _common(run) | {
         "terms": list(s.model.basis(s.model.chips[0].number).terms),
         "grid": list(s.grid),
         "epoch": s.epoch,
@@ -65,32 +65,33 @@ def budget_data(r: ReportInput) -> dict[str, Any]:
 
 
 @REPORT.data()
-def map_data(r: ReportInput) -> dict[str, Any]:
+def map_data(run: ReportedRun) -> dict[str, Any]:
     """Maps of the uncertainty per axis and the pixel area, read with a pointer."""
-    chips = r.chips
     layers = []
-    for k, first in enumerate(chips[0].maps):
-        sigma = [c.maps[k].per_axis for c in chips]
-        layers.append(_layer(f"Uncertainty per axis, {first.kind}", r.unit, sigma))
-    layers.append(_layer("Pixel area, relative", "", [c.area.area for c in chips], digits=7))
-    return _common(r) | {"layers": layers}
+    for maps in zip(*shown_maps(run), strict=True):
+        first, sigma = maps[0], [m.per_axis for m in maps]
+        layers.append(_layer(f"Uncertainty per axis, {first.kind}", run.model.unit, sigma))
+    layers.append(
+        _layer("Pixel area, relative", "", [area.area for area in run.evaluation.areas], digits=7)
+    )
+    return _common(run) | {"layers": layers}
 
 
-def _common(r: ReportInput) -> dict[str, Any]:
+def _common(run: ReportedRun) -> dict[str, Any]:
     colors = matplotlib.colormaps[SEQUENTIAL](np.linspace(0.0, 1.0, _COLORS))
     return {
-        "unit": r.unit,
-        "scale_mas": r.scale_mas,
-        "ladders": {unit: ladder(unit) for unit in (r.unit, "mas")},
+        "unit": run.model.unit,
+        "scale_mas": scale_mas(run),
+        "ladders": {unit: ladder(unit) for unit in (run.model.unit, "mas")},
         "colors": [to_hex(c) for c in colors],
         "chips": [
             {
-                "number": c.chip.number,
-                "name": c.chip.name or f"chip {c.chip.number}",
-                "size": list(c.chip.size),
-                "place": list(c.place),
+                "number": chip.number,
+                "name": chip.name or f"chip {chip.number}",
+                "size": list(chip.size),
+                "place": list(place),
             }
-            for c in r.chips
+            for chip, place in zip(run.model.chips, mosaic_of(run).places, strict=True)
         ],
     }
 

@@ -6,17 +6,17 @@ rotation of a solution are therefore meaningless until their zero points are def
 
 from __future__ import annotations
 
-from bayesdist.report.context import ReportInput
+from bayesdist.report.run import ReportedRun
 
 
-def gauge_mark(r: ReportInput) -> str:
+def gauge_mark(run: ReportedRun) -> str:
     """Clause of a caption about the gauge; empty if a single system leaves no choice."""
-    return ", in the fit's own gauge" if r.fit.model.n_frame else ""
+    return ", in the fit's own gauge" if run.model.n_frame else ""
 
 
-def gauge_note(r: ReportInput) -> str:
+def gauge_note(run: ReportedRun) -> str:
     """Sentences on the gauge of the fit; empty if there is no choice."""
-    model = r.fit.model
+    model = run.model
     if not model.n_frame:
         return ""
     first = model.exposures[0]
@@ -30,8 +30,8 @@ def gauge_note(r: ReportInput) -> str:
     )
 
 
-def gauge_of_maps(r: ReportInput) -> str:
+def gauge_of_maps(run: ReportedRun) -> str:
     """Sentence on shift and rotation in the maps of the uncertainty; empty without frames."""
-    if not r.fit.model.n_frame:
+    if not run.model.n_frame:
         return ""
-    return r.words.gauge_of_maps.format(first=r.fit.model.exposures[0])
+    return run.kind.words.gauge_of_maps.format(first=run.model.exposures[0])

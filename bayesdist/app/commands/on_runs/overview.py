@@ -10,7 +10,6 @@ from typing import Any
 from urllib.parse import quote
 
 from bayesdist.app.config import config_of_record
-from bayesdist.app.report import title_of
 from bayesdist.app.screen import table_text
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.store.summary import head_of
@@ -52,7 +51,7 @@ def _row(run: RunDirectory, output: Path) -> OverviewRow:
     return OverviewRow(
         name=run.path.as_posix(),
         link=link,
-        detector=title_of(config),
+        detector=config.detector_title,
         simulated=bool(head["simulated"]),
         level=verdict["level"],
         headline=verdict["headline"],

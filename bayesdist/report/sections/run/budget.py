@@ -12,8 +12,7 @@ from matplotlib.patches import Patch
 
 from bayesdist.assess.maps import circular_error
 from bayesdist.assess.terms.forms import PRODUCT
-from bayesdist.report.contents import REPORT, Plot
-from bayesdist.report.context import ReportInput, needed
+from bayesdist.report.contents import REPORT, Plot, needed
 from bayesdist.report.figures.fields import Grid, scalar_map
 from bayesdist.report.figures.panels import ChipPanels
 from bayesdist.report.figures.style import CYCLE, WIDTH, new_figure
@@ -22,6 +21,15 @@ from bayesdist.report.plots.errors import (
     largest_error,
     plot_budget,
     row_per_axis,
+)
+from bayesdist.report.run import (
+    ReportedRun,
+    has_several_chips,
+    length_text,
+    marked,
+    mosaic_of,
+    on_focal_plane,
+    scale_mas,
 )
 from bayesdist.report.texttable import TextTable
 from bayesdist.utils.arrays import Float
@@ -42,18 +50,18 @@ _LETTERS = 31  # of a label next to another one, above a narrow figure
 _MOST_PANELS = 3  # chips with a panel in addition to that of the detector
 
 
-@REPORT.table("budget", needs=("budget",))
-def budget_table(r: ReportInput) -> tuple[TextTable, ...]:
+@REPORT.table("budget")
+def budget_table(run: ReportedRun) -> tuple[TextTable, ...]:
     """Table of the error budget, the total last; correlated parts of the model are folded."""
-    budget = needed(r.budget)
+    budget = run.evaluation.budget
     if budget.model is None:
-        return (_table(r, budget, budget),)
+        return (_table(run, budget, budget),)
     parts = {term.name for term in budget.terms if term.of_parameters}
     jointly = replace(budget, terms=_jointly(budget))
     alone = replace(budget, terms=tuple(t for t in budget.terms if t.name in parts), products=())
-    folded = _table(r, budget, alone, names=parts)
+    folded = _table(run, budget, alone, names=parts)
     return (
-        *_by_chip(r, _table(r, budget, jointly)),
+        *_by_chip(run, _table(run, budget, jointly)),
         replace(
             folded,
             caption="Parts of the model: their errors are correlated and enter the total jointly",
@@ -64,9 +72,9 @@ def budget_table(r: ReportInput) -> tuple[TextTable, ...]:
     )
 
 
-def _by_chip(r: ReportInput, table: TextTable) -> tuple[TextTable, ...]:
+def _by_chip(run: ReportedRun, table: TextTable) -> tuple[TextTable, ...]:
     """The table, with the rows of single chips folded if they are many."""
-    if len(r.chips) <= _MOST_PANELS:
+    if len(run.model.chips) <= _MOST_PANELS:
         return (table,)
     single = replace(table, rows=table.rows[table.leading :], folded=True, detail=True, note="")
     return (
@@ -81,29 +89,29 @@ def _jointly(budget: ErrorBudget) -> tuple[BudgetTerm, ...]:
 
 
 def _table(
-    r: ReportInput, budget: ErrorBudget, shown: ErrorBudget, names: Collection[str] = ()
+    run: ReportedRun, budget: ErrorBudget, shown: ErrorBudget, names: Collection[str] = ()
 ) -> TextTable:
     """Table of terms of a budget; `names`: terms to show, or empty for all."""
-    unit, mas = budget.unit, r.scale_mas
-    chips = {str(c.chip.number): c.chip.name for c in r.chips} | {"all": "all"}
+    unit, mas = budget.unit, scale_mas(run)
+    chips = {str(chip.number): chip.name for chip in run.model.chips} | {"all": "all"}
     together = [row for row in shown.rows() if not names or row["name"] in names]
     rows = together
-    if r.several:
+    if has_several_chips(run):
         rows = [row for row in shown.rows_by_chip() if not names or row["name"] in names]
     typical = row_per_axis(budget.rows()[-1])
     scale = length_scale(unit, typical)
     out = [
         (
             str(row["name"]),
-            *((chips[str(row["chip"])],) if r.several else ()),
+            *((chips[str(row["chip"])],) if has_several_chips(run) else ()),
             str(row["kind"]),
             AS_ABOVE if str(row.get("chip", "all")) != "all" else str(row["source"]) or MISSING,
-            *(r.marked(text) for text in _sizes(row, scale, mas, typical)),
+            *(marked(run, text) for text in _sizes(row, scale, mas, typical)),
             _relative_uncertainty(row),
         )
         for row in rows
     ]
-    of_chip = ("Chip",) if r.several else ()
+    of_chip = ("Chip",) if has_several_chips(run) else ()
     lengths = [f"{name} [{scale.unit}]" for name in ("u", "v", "Per axis", "CE68", "CE95")]
     heads = ("Term", *of_chip, "Kind", "Source", *lengths, "Relative uncertainty")
     epoch = budget.epoch
@@ -118,14 +126,14 @@ def _table(
         note="Per axis: rms of u and v; CE68, CE95: circles that hold 68 and 95 % of errors of that"
         " size, if Gaussian. The parts of the model are correlated and enter the total jointly, by"
         " draws; independent terms add in quadrature. The total therefore need not be the root"
-        f" of the sum of squares.{_of_products(rows)} {r.words.new_exposure}".rstrip()
-        + _focal_plane(r),
+        f" of the sum of squares.{_of_products(rows)} {run.kind.words.new_exposure}".rstrip()
+        + _focal_plane(run),
     )
 
 
-def _focal_plane(r: ReportInput) -> str:
+def _focal_plane(run: ReportedRun) -> str:
     """Sentence on the size of a milliarcsecond on the focal plane, if the plate scale is known."""
-    size = r.on_focal_plane(1.0, "mas").strip(" ()")
+    size = on_focal_plane(run, 1.0, "mas").strip(" ()")
     return f" On the focal plane 1\u202fmas is {size}." if size else ""
 
 
@@ -159,17 +167,17 @@ def _of_products(rows: Sequence[Mapping[str, Any]]) -> str:
     )
 
 
-@REPORT.figure("budget", needs=("budget",))
-def budget_terms(r: ReportInput) -> Plot:
+@REPORT.figure("budget")
+def budget_terms(run: ReportedRun) -> Plot:
     """Bars of each term's rms per axis over the detector, with its two axes marked.
 
     Each of up to three chips has a panel next to that of the whole detector.
     """
-    budget = needed(r.budget)
+    budget = run.evaluation.budget
     rows = budget.rows()
     parts = {"all chips": rows}
     if 1 < len(budget.chips) <= _MOST_PANELS:
-        parts |= {n: b.rows() for n, b in zip(r.mosaic.names, budget.chips, strict=True)}
+        parts |= {n: b.rows() for n, b in zip(mosaic_of(run).names, budget.chips, strict=True)}
     largest = largest_error(list(parts.values()))
     fig = new_figure(WIDTH, (1.1 if len(parts) == 1 else 1.3) + 0.34 * len(rows))
     axes = fig.subplots(1, len(parts), sharey=True, squeeze=False)[0]
@@ -186,22 +194,20 @@ def budget_terms(r: ReportInput) -> Plot:
     return Plot(
         fig,
         "Error budget by term",
-        f"The largest term is {top['name']}, {r.length(row_per_axis(top))}, of a total of"
-        f" {r.length(row_per_axis(total))} (rms over the detector, per axis).",
+        f"The largest term is {top['name']}, {length_text(run, row_per_axis(top))}, of a total of"
+        f" {length_text(run, row_per_axis(total))} (rms over the detector, per axis).",
         f"Bars of the budget's terms; the largest is {top['name']}.",
     )
 
 
-@REPORT.figure(
-    "budget", needs=("budget",), when=lambda r: int(np.count_nonzero(r.budget.share)) > 1
-)
-def budget_dominating(r: ReportInput) -> Plot:
+@REPORT.figure("budget", when=lambda run: int(np.count_nonzero(run.evaluation.budget.share)) > 1)
+def budget_dominating(run: ReportedRun) -> Plot:
     """Map of the term that contributes most at each position, if it is not the same everywhere."""
-    budget = needed(r.budget)
+    budget = run.evaluation.budget
     share = budget.share
     present = np.flatnonzero(share)
     colors = [CYCLE[k % len(CYCLE)] for k in range(len(present))]
-    panels = ChipPanels(r.mosaic)
+    panels = ChipPanels(mosaic_of(run))
     panels.frame()
 
     def numbered(dominant: Float) -> Float:
@@ -211,7 +217,7 @@ def budget_dominating(r: ReportInput) -> Plot:
     scalar_map(
         panels,
         [Grid(*b.axes, numbered(b.on_grid(b.dominant))) for b in budget.chips],
-        r.mosaic.names,
+        mosaic_of(run).names,
         norm=BoundaryNorm(np.arange(len(present) + 1) - 0.5, len(present)),
         cmap=ListedColormap(colors),
     )

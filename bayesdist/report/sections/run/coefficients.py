@@ -6,9 +6,11 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from astropy.table import Table
 
+from bayesdist.assess.solution import coefficient_table
 from bayesdist.report.contents import REPORT
-from bayesdist.report.context import ReportInput
+from bayesdist.report.run import ReportedRun, has_several_chips, marked
 from bayesdist.report.sections.gauge import gauge_mark, gauge_note
 from bayesdist.report.texttable import MAX_ROWS, TextTable, further, tabulated
 from bayesdist.utils.numbers import MISSING, interval, number, rounded
@@ -20,14 +22,15 @@ _SMALL = 1e-3  # dimensionless numbers below it are shown in 10^-6
 
 
 @REPORT.table("coefficients")
-def coefficient_tables(r: ReportInput) -> tuple[TextTable, ...]:
+def coefficient_tables(run: ReportedRun) -> tuple[TextTable, ...]:
     """Tables of Legendre coefficients, of time dependence and frames, of monomial coefficients.
 
     All are folded on screen; the Legendre coefficients are printed.
     """
-    kinds = {p.name: p.kind for p in r.fit.model.parameters}
-    rows = list(r.coefficients)
-    mark, held = gauge_mark(r), r.held
+    kinds = {p.name: p.kind for p in run.model.parameters}
+    table = coefficient_table(run.fit, run.solution)
+    rows = list(table)
+    mark, held = gauge_mark(run), run.held_parameters
     groups = []
     for names in (("polynomial",), ("tdd", "frame")):
         rows_of_kind = [row for row in rows if kinds.get(str(row["name"])) in names]
@@ -37,23 +40,23 @@ def coefficient_tables(r: ReportInput) -> tuple[TextTable, ...]:
         )
     (polynomial, fixed), (other_parameters, fixed_others) = groups
     legendre = _parameter_table(
-        r,
-        f"Legendre coefficients [{r.unit}]{mark}: formal error beside posterior error",
+        run,
+        f"Legendre coefficients [{run.model.unit}]{mark}: formal error beside posterior error",
         polynomial,
         with_unit=False,
     )
-    notes = gauge_note(r), _common_note(r), _held_note(r, fixed)
+    notes = gauge_note(run), _common_note(run, table), _held_note(run, fixed)
     out = [replace(legendre, note=_notes(*notes), leading=MAX_PRINTED, folded=True)]
     if other_parameters:
         table = _parameter_table(
-            r,
+            run,
             f"Time dependence and exposure frames{mark}",
             other_parameters[:MAX_ROWS],
             with_unit=True,
         )
-        note = _notes(_held_note(r, fixed_others), further(len(other_parameters)))
+        note = _notes(_held_note(run, fixed_others), further(len(other_parameters)))
         out.append(replace(table, note=note, detail=True, folded=True))
-    out += [_monomial_table(r, chip.number) for chip in r.fit.model.chips]
+    out += [_monomial_table(run, chip.number) for chip in run.model.chips]
     return tuple(out)
 
 
@@ -61,14 +64,12 @@ def _notes(*sentences: str) -> str:
     return " ".join(s for s in sentences if s)
 
 
-def _common_note(r: ReportInput) -> str:
+def _common_note(run: ReportedRun, table: Table) -> str:
     """Note on posterior errors that are larger than the scatter of the sampler's draws."""
-    if r.posterior is None or "sd" not in r.coefficients.colnames:
-        return ""
-    sampled = dict(zip(r.posterior.model.names, r.posterior.sigma, strict=True))
+    sampled = dict(zip(run.posterior.model.names, run.posterior.sigma, strict=True))
     wider = [
         float(row["sd"]) > _WIDER * sampled[str(row["name"])]
-        for row in r.coefficients
+        for row in table
         if str(row["name"]) in sampled and row["sd"] is not np.ma.masked
     ]
     if not any(wider):
@@ -79,7 +80,7 @@ def _common_note(r: ReportInput) -> str:
     )
 
 
-def _held_note(r: ReportInput, names: list[str]) -> str:
+def _held_note(run: ReportedRun, names: list[str]) -> str:
     """Note on parameters that are not measurements, grouped by term."""
     if not names:
         return ""
@@ -91,7 +92,7 @@ def _held_note(r: ReportInput, names: list[str]) -> str:
         f"{term} ({', '.join(kinds)})" if term else ", ".join(kinds)
         for term, kinds in terms.items()
     ]
-    return f"{r.words.held}: {'; '.join(texts)}."
+    return f"{run.kind.words.held}: {'; '.join(texts)}."
 
 
 def _readable(row: Any) -> tuple[float, str]:
@@ -102,13 +103,11 @@ def _readable(row: Any) -> tuple[float, str]:
 
 
 def _parameter_table(
-    r: ReportInput, caption: str, rows: list[Any], *, with_unit: bool
+    run: ReportedRun, caption: str, rows: list[Any], *, with_unit: bool
 ) -> TextTable:
-    column_names = set(r.coefficients.colnames)
-
     def cell(row: Any, key: str, factor: float = 1.0) -> Any:
-        value = row[key] if key in column_names else None
-        return value if value is None or value is np.ma.masked else factor * value
+        value = row[key]
+        return value if value is np.ma.masked else factor * value
 
     out = []
     for row in rows:
@@ -129,7 +128,7 @@ def _parameter_table(
                 "Name": str(row["name"]),
                 "Least squares": rounded(cell(row, "lsq_value", factor), sigma),
                 "Formal σ": number(sigma, 2),
-                **{key: r.marked(text) for key, text in sampled.items()},
+                **{key: marked(run, text) for key, text in sampled.items()},
                 "R-hat": number(cell(row, "rhat"), 4),
                 "ESS": number(cell(row, "ess_bulk"), 3),
                 **({"Unit": unit} if with_unit else {}),
@@ -140,25 +139,22 @@ def _parameter_table(
     return tabulated(caption, out, words=(0, 10), on_paper=on_paper)
 
 
-def _monomial_table(r: ReportInput, chip: int) -> TextTable:
+def _monomial_table(run: ReportedRun, chip: int) -> TextTable:
     """Table of coefficients of (x - xref)^i (y - yref)^j with propagated errors."""
-    model = r.fit.model
+    model = run.model
     basis = model.basis(chip)
-    gauge = gauge_note(r) if chip == model.chips[0].number else ""
-    name = model.chips[model.chip_code(chip)].name if r.several else chip
+    gauge = gauge_note(run) if chip == model.chips[0].number else ""
+    name = model.chips[model.chip_code(chip)].name if has_several_chips(run) else chip
     cells = []
     for axis in (0, 1):
-        coefficients = r.fit.model.coefficient_slice(chip, axis)
-        for solution in (r.fit, r.posterior):
-            if solution is None:
-                cells.append([(MISSING, MISSING)] * basis.n_terms)
-                continue
+        coefficients = run.model.coefficient_slice(chip, axis)
+        for solution in (run.fit, run.posterior):
             cov = np.asarray(solution.cov)[coefficients, coefficients]
             values, covariance = basis.to_monomials(np.asarray(solution.mean)[coefficients], cov)
             sigma = np.sqrt(np.diag(covariance))
             texts = [(rounded(c, s), number(s, 2)) for c, s in zip(values, sigma, strict=True)]
-            if solution is r.posterior:
-                texts = [(r.marked(c), r.marked(s)) for c, s in texts]
+            if solution is run.posterior:
+                texts = [(marked(run, c), marked(run, s)) for c, s in texts]
             cells.append(texts)
     rows = []
     for axis in (0, 1):
@@ -168,7 +164,7 @@ def _monomial_table(r: ReportInput, chip: int) -> TextTable:
     x, y = basis.reference_pixel
     return TextTable(
         f"Monomial coefficients, chip {name}: of (x − {x:g})^i (y − {y:g})^j"
-        f" [{r.unit}/pix^(i + j)]{gauge_mark(r)}",
+        f" [{run.model.unit}/pix^(i + j)]{gauge_mark(run)}",
         ("Axis", "i", "j", "Least squares", "Formal σ", "Posterior mean", "sd"),
         tuple(rows),
         note=_notes(

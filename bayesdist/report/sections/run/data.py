@@ -8,11 +8,11 @@ import numpy as np
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
-from bayesdist.report.contents import REPORT, Plot
-from bayesdist.report.context import ReportInput, needed
+from bayesdist.report.contents import REPORT, Plot, needed
 from bayesdist.report.figures.fields import Grid, scalar_map
 from bayesdist.report.figures.style import WIDTH, new_figure
 from bayesdist.report.plots.residuals import draw_density
+from bayesdist.report.run import ReportedRun, marked, sample_words, setting, shown_residuals
 from bayesdist.report.sections.run.maps import map_panels, map_titles
 from bayesdist.report.texttable import (
     MAX_ROWS,
@@ -30,17 +30,17 @@ if TYPE_CHECKING:
 
 
 @REPORT.table("data")
-def data_tables(r: ReportInput) -> tuple[TextTable, ...]:
+def data_tables(run: ReportedRun) -> tuple[TextTable, ...]:
     """Tables of rows read and rejected, errors by magnitude, and exposures."""
-    m, fit, words = r.stars.table, r.fit, r.words
-    partial = ", of the sample" if r.stars.partial else ""
+    m, fit, words = run.diagnostics.sample.table, run.fit, run.kind.words
+    partial = ", of the sample" if run.diagnostics.sample.partial else ""
     pairs = {
         "Sources": ", ".join(short_paths(m.sources)),
         "Rows read": count(m.n_rows),
-        words.all_rows.capitalize(): count(r.stars.n_total),
+        words.all_rows.capitalize(): count(run.diagnostics.sample.n_total),
         f"Used by the {words.rejection}": count(fit.n_used),
         "Unit of u, v": m.unit,
-        "Exposures": count(np.count_nonzero(r.exposures.n)),
+        "Exposures": count(np.count_nonzero(run.diagnostics.sums.exposures.n)),
     }
     if any(m.filter_names):
         pairs["Filters"] = ", ".join(f for f in m.filter_names if f)
@@ -49,10 +49,10 @@ def data_tables(r: ReportInput) -> tuple[TextTable, ...]:
         pairs[f"Epochs [yr]{partial}"] = first if first == last else f"{first} to {last}"
     if m.mag is not None and np.isfinite(m.mag).any():
         pairs[f"Magnitudes{partial}"] = f"{np.nanmin(m.mag):.2f} to {np.nanmax(m.mag):.2f}"
-    sigma_setting = r.setting("data", "sigma", "as given")
+    sigma_setting = setting(run, "data", "sigma", "as given")
     pairs[f"Errors of the {words.rows}"] = (
         "by magnitude, see below"
-        if r.magnitude_errors is not None
+        if run.errors.by_magnitude is not None
         else (
             str(sigma_setting)
             if isinstance(sigma_setting, str)
@@ -65,26 +65,24 @@ def data_tables(r: ReportInput) -> tuple[TextTable, ...]:
         "Rows left out, by reason",
         ("Reason", "Rows"),
         tuple(reasons) or (("none", "0"),),
-        note=f"The posterior uses all {words.all_rows}: the mixture replaces rejection."
-        if r.posterior is not None
-        else "",
+        note=f"The posterior uses all {words.all_rows}: the mixture replaces rejection.",
     )
-    note = f"Figures and tables of single {words.rows} show {r.sample}." if partial else ""
+    note = f"Figures and tables of single {words.rows} show {sample_words(run)}." if partial else ""
     out = [listing("Input", pairs, note), rejected]
-    if r.magnitude_errors is not None:
-        out.append(_magnitude_table(r))
+    if run.errors.by_magnitude is not None:
+        out.append(_magnitude_table(run))
     if len(m.exposure_names) > 1:
-        out.append(_exposure_table(r))
+        out.append(_exposure_table(run))
     return tuple(out)
 
 
-def _magnitude_table(r: ReportInput) -> TextTable:
-    e = needed(r.magnitude_errors)
-    scale = display_scale(r.unit, np.concatenate([e.sigma_u, e.sigma_v]))
+def _magnitude_table(run: ReportedRun) -> TextTable:
+    e = needed(run.errors.by_magnitude)
+    scale = display_scale(run.model.unit, np.concatenate([e.sigma_u, e.sigma_v]))
     rows = [
         {
             "Magnitude": f"{mag:.2f}".replace("-", "−"),
-            r.words.rows.capitalize(): count(n),
+            run.kind.words.rows.capitalize(): count(n),
             f"σ u [{scale.unit}]": number(su * scale.factor),
             f"σ v [{scale.unit}]": number(sv * scale.factor),
         }
@@ -94,44 +92,48 @@ def _magnitude_table(r: ReportInput) -> TextTable:
     return tabulated(caption, rows, words=(), detail=True)
 
 
-def _exposure_table(r: ReportInput) -> TextTable:
-    names, fit, sums = r.stars.table.exposure_names, r.fit, r.exposures
-    scale = display_scale(r.unit, [fit.rms_u, fit.rms_v])
-    flagged = r.flagged
+def _exposure_table(run: ReportedRun) -> TextTable:
+    names, fit, sums = (
+        run.diagnostics.sample.table.exposure_names,
+        run.fit,
+        run.diagnostics.sums.exposures,
+    )
+    scale = display_scale(run.model.unit, [fit.rms_u, fit.rms_v])
+    flagged = run.diagnostics.flagged
     rows = [
         {
             "Exposure": names[k],
-            r.words.rows.capitalize(): count(sums.n[k]),
+            run.kind.words.rows.capitalize(): count(sums.n[k]),
             "Used": count(sums.n_used[k]),
             f"rms u [{scale.unit}]": number(sums.rms[0][k] * scale.factor),
             f"rms v [{scale.unit}]": number(sums.rms[1][k] * scale.factor),
-            "Outliers (P > 0.5)": MISSING if flagged is None else r.marked(count(flagged[k])),
+            "Outliers (P > 0.5)": MISSING if flagged is None else marked(run, count(flagged[k])),
         }
         for k in np.flatnonzero(sums.n)
     ]
     return tabulated("Exposures", rows[:MAX_ROWS], note=further(len(rows)), detail=True)
 
 
-@REPORT.figure("data", when=lambda r: bool(_magnitudes(r).any()))
-def residuals_by_magnitude(r: ReportInput) -> Plot:
+@REPORT.figure("data", when=lambda run: bool(_magnitudes(run).any()))
+def residuals_by_magnitude(run: ReportedRun) -> Plot:
     """Density of the residuals against magnitude, with the errors assigned to each magnitude."""
-    words, has_magnitude = r.words, _magnitudes(r)
+    words, has_magnitude = run.kind.words, _magnitudes(run)
     text = f"Residuals grow towards faint stars; colour counts {words.rows}."
-    if r.magnitude_errors is not None:
+    if run.errors.by_magnitude is not None:
         addition = (
             ", or somewhat more, because the stars were fitted to them" if words.leverage else ""
         )
         text += " The lines are ±1 σ as assigned to each magnitude: about two thirds of the"
         text += f" {words.rows} lie between them{addition}."
-    if r.sample:
-        text += f" Drawn from {r.sample}."
+    if sample_words(run):
+        text += f" Drawn from {sample_words(run)}."
     return Plot(
         _density(
-            needed(r.stars.table.mag)[has_magnitude],
-            r.stars.residual[has_magnitude],
-            unit=r.unit,
-            errors=r.magnitude_errors,
-            shown=f"sampled {words.rows}" if r.stars.partial else words.rows,
+            needed(run.diagnostics.sample.table.mag)[has_magnitude],
+            run.diagnostics.sample.residual[has_magnitude],
+            unit=run.model.unit,
+            errors=run.errors.by_magnitude,
+            shown=f"sampled {words.rows}" if run.diagnostics.sample.partial else words.rows,
         ),
         "Residuals against magnitude",
         text,
@@ -139,13 +141,15 @@ def residuals_by_magnitude(r: ReportInput) -> Plot:
     )
 
 
-@REPORT.figure("data", printed=lambda r: r.words.prints_data)
-def coverage(r: ReportInput) -> Plot:
+@REPORT.figure("data", printed=lambda run: run.kind.words.prints_data)
+def coverage(run: ReportedRun) -> Plot:
     """Map of the number of stars in each cell of the detector."""
-    grids = [Grid(c.binned.x, c.binned.y, np.asarray(c.binned.count, float)) for c in r.chips]
-    panels = map_panels(r)
+    grids = [
+        Grid(cells.x, cells.y, np.asarray(cells.count, float)) for cells in shown_residuals(run)
+    ]
+    panels = map_panels(run)
     counts = np.concatenate([g.values.ravel() for g in grids])
-    rows = r.words.rows
+    rows, false_rows = run.kind.words.rows, run.kind.words.false_rows
     scalar_map(
         panels,
         grids,
@@ -157,17 +161,17 @@ def coverage(r: ReportInput) -> Plot:
     return Plot(
         panels.figure,
         "Coverage of the detector",
-        f"Number of {rows} in each cell that are no likely {r.words.false_rows}: {count(empty)} of"
+        f"Number of {rows} in each cell that are no likely {false_rows}: {count(empty)} of"
         f" {count(counts.size)} cells are empty, and the median is {np.median(counts):.0f}. Where"
         f" there are no {rows}, the solution is an extrapolation of the polynomial.",
         f"Map of the number of {rows} per cell; {empty} of {counts.size} cells are empty.",
     )
 
 
-def _magnitudes(r: ReportInput) -> Bool:
+def _magnitudes(run: ReportedRun) -> Bool:
     """Boolean mask (N,) that is True for stars with a known magnitude."""
-    mag = r.stars.table.mag
-    return np.zeros(len(r.stars.table), bool) if mag is None else np.isfinite(mag)
+    mag = run.diagnostics.sample.table.mag
+    return np.zeros(len(run.diagnostics.sample.table), bool) if mag is None else np.isfinite(mag)
 
 
 def _density(

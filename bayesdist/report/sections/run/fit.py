@@ -8,7 +8,14 @@ from bayesdist.diagnose.residuals.tables import residual_statistics
 from bayesdist.diagnose.score.result import POWER
 from bayesdist.infer.solution.geometry import geometries, skew_of
 from bayesdist.report.contents import REPORT
-from bayesdist.report.context import ReportInput
+from bayesdist.report.run import (
+    ReportedRun,
+    has_several_chips,
+    marked,
+    sample_words,
+    scale_mas,
+    setting,
+)
 from bayesdist.report.texttable import TextTable, listing, tabulated
 from bayesdist.utils.arrays import Bool
 from bayesdist.utils.limits import SCORE_TESTS
@@ -16,47 +23,49 @@ from bayesdist.utils.numbers import MISSING, count, display_scale, number, round
 
 
 @REPORT.table("fit")
-def fit_tables(r: ReportInput) -> tuple[TextTable, ...]:
+def fit_tables(run: ReportedRun) -> tuple[TextTable, ...]:
     """Tables of the numbers of the linear fit, and of statistics of its residuals."""
-    fit, model, stars = r.fit, r.fit.model, r.stars
-    mas, words = r.scale_mas, r.words
+    fit, model, stars = run.fit, run.model, run.diagnostics.sample
+    mas, words = scale_mas(run), run.kind.words
     pairs = {
         "Polynomial order": str(model.order),
         "Parameters": f"{count(model.n_params)} ({count(model.n_polynomial)} polynomial)",
         "Chips": ", ".join(c.name or str(c.number) for c in model.chips),
         "Frame of each exposure": model.frames.replace("_", ", "),
-        "Time-dependent terms": _drifting(r),
+        "Time-dependent terms": _drifting(run),
         "Chi-square / degrees of freedom": f"{count(fit.chi2)} / {count(fit.dof)} ="
         f" {number(fit.chi2 / fit.dof if fit.dof > 0 else None)}",
-        "rms of u": with_mas(fit.rms_u, r.unit, mas),
-        "rms of v": with_mas(fit.rms_v, r.unit, mas),
+        "rms of u": with_mas(fit.rms_u, run.model.unit, mas),
+        "rms of v": with_mas(fit.rms_v, run.model.unit, mas),
         f"{words.rows} used, left out".capitalize(): f"{count(fit.n_used)}, "
         f"{count(fit.n_rejected)}",
         "Condition of the scaled normal matrix": number(fit.condition, 2),
     }
-    scale = display_scale(r.unit, [fit.rms_u, fit.rms_v])
+    scale = display_scale(run.model.unit, [fit.rms_u, fit.rms_v])
     names = ("mean", "sigma", "min", "max", "median", "p01", "p99")
     heads = ("Mean", "σ", "Min", "Max", "Median", "1 %", "99 %")
     rows = []
-    for chip, on_chip in _chips_of_stars(r):
+    for chip, on_chip in _chips_of_stars(run):
         for axis, values in zip("uv", stars.fit_residual[on_chip].T, strict=True):
             if values.size:
                 s = residual_statistics(values * scale.factor)
                 rows.append((f"{chip}{axis}", *(rounded(s[k], s["sigma"] / 10) for k in names)))
-    if r.held:
-        pairs["Parameters"] += f", {count(len(r.held))} of them held by {words.constraint}"
-    notes = [f"From {r.sample}."] if r.sample else []
+    if run.held_parameters:
+        pairs["Parameters"] += (
+            f", {count(len(run.held_parameters))} of them held by {words.constraint}"
+        )
+    notes = [f"From {sample_words(run)}."] if sample_words(run) else []
     if words.leverage:
         notes.append(
             "The stars were fitted to these detections, so that residuals are smaller than errors."
         )
     return (
         listing(words.fit.capitalize(), pairs),
-        _geometry_table(r),
-        *((_skew_table(r),) if r.setting("fit", "skew", False) else ()),
+        _geometry_table(run),
+        *((_skew_table(run),) if setting(run, "fit", "skew", False) else ()),
         TextTable(
             f"Residuals of the {words.rows} used [{scale.unit}]",
-            ("Chip, axis" if r.several else "Axis", *heads),
+            ("Chip, axis" if has_several_chips(run) else "Axis", *heads),
             tuple(rows),
             note=" ".join(notes),
             detail=True,
@@ -65,11 +74,11 @@ def fit_tables(r: ReportInput) -> tuple[TextTable, ...]:
     )
 
 
-def _geometry_table(r: ReportInput) -> TextTable:
+def _geometry_table(run: ReportedRun) -> TextTable:
     """Table of the scales, orientation, parity and largest distortion of each chip."""
-    names = {chip.number: chip.name or str(chip.number) for chip in r.fit.model.chips}
+    names = {chip.number: chip.name or str(chip.number) for chip in run.model.chips}
     rows = []
-    chips = geometries(r.fit)
+    chips = geometries(run.fit)
     for chip in chips:
         x, y, _ = chip.scales
         angle = f"{chip.position_angle:.2f}".replace("-", "−")
@@ -96,25 +105,23 @@ def _geometry_table(r: ReportInput) -> TextTable:
     return TextTable("Geometry", heads, tuple(rows), note=note)
 
 
-def _skew_table(r: ReportInput) -> TextTable:
+def _skew_table(run: ReportedRun) -> TextTable:
     """Table of the skew in the linear terms of each chip."""
     rows = []
-    for c in r.chips:
-        for name, solution in (("least squares", r.fit), ("posterior", r.posterior)):
-            if solution is None:
-                continue
-            skew = skew_of(solution, chip=c.chip.number)
+    for chip in run.model.chips:
+        for name, solution in (("least squares", run.fit), ("posterior", run.posterior)):
+            skew = skew_of(solution, chip=chip.number)
             cells = [
                 rounded(1e6 * skew.value, 1e6 * skew.sigma),
                 number(1e6 * skew.sigma, 2),
                 number(skew.significance, 3),
             ]
             if name == "posterior":
-                cells = [r.marked(text) for text in cells]
-            rows.append((f"{c.chip.name}, {name}" if r.several else name, *cells))
+                cells = [marked(run, text) for text in cells]
+            rows.append((f"{chip.name}, {name}" if has_several_chips(run) else name, *cells))
     note = "The angle from the image of a row to that of a column is 90° plus the skew. It is held"
     note += " by the linear terms, which are all free: beside them there is no further parameter."
-    weight = r.setting("fit", "radial_weight", 1.0)
+    weight = setting(run, "fit", "radial_weight", 1.0)
     if weight != 1.0:
         note += (
             f" With {weight:g} times the weight in the corners the weights of the fit are not the"
@@ -123,19 +130,19 @@ def _skew_table(r: ReportInput) -> TextTable:
         )
     return TextTable(
         "Skew of the axes at the reference pixel [10⁻⁶ rad]",
-        ("Chip, solution" if r.several else "Solution", "Skew", "σ", "Skew / σ"),
+        ("Chip, solution" if has_several_chips(run) else "Solution", "Skew", "σ", "Skew / σ"),
         tuple(rows),
         note=note,
     )
 
 
-def _drifting(r: ReportInput) -> str:
+def _drifting(run: ReportedRun) -> str:
     """Clause on terms with a fitted drift, and on constants that may step."""
-    model = r.fit.model
+    model = run.model
     time = model.time
     if time is None:
         return "none"
-    drift = r.setting("model", "tdd", {})
+    drift = setting(run, "model", "tdd", {})
     asked = [tuple(term) for term in drift.get("terms", time.terms)]
     text = ", ".join(f"{a}_{i}_{j}" for a, i, j in asked)
     steps = {
@@ -144,7 +151,7 @@ def _drifting(r: ReportInput) -> str:
         if p.kind == "tdd"
         and (p.i, p.j) == (0, 0)
         and (p.axis, p.i, p.j) not in asked
-        and p.name not in r.held
+        and p.name not in run.held_parameters
     }
     if not steps:
         return text
@@ -153,25 +160,25 @@ def _drifting(r: ReportInput) -> str:
     return f"{text}; besides, the constants of {chips} may step at {breaks}"
 
 
-def _chips_of_stars(r: ReportInput) -> list[tuple[str, Bool]]:
+def _chips_of_stars(run: ReportedRun) -> list[tuple[str, Bool]]:
     """Row names and masks (N,) of the stars used, for all chips and, if several, for each chip."""
-    table, used = r.stars.table, r.stars.used
-    if not r.several:
+    table, used = run.diagnostics.sample.table, run.diagnostics.sample.used
+    if not has_several_chips(run):
         return [("", used)]
     numbers = table.chip_number
-    each = [(f"{c.chip.name}, ", used & (numbers == c.chip.number)) for c in r.chips]
+    each = [(f"{chip.name}, ", used & (numbers == chip.number)) for chip in run.model.chips]
     return [("all, ", used), *each]
 
 
-@REPORT.table("fit", needs=("score_tests",))
-def score_test_table(r: ReportInput) -> TextTable:
+@REPORT.table("fit", needs=("diagnostics.score_tests",))
+def score_test_table(run: ReportedRun) -> TextTable:
     """Table of the tests of the residuals and their results."""
-    sizes = [t.smallest for t in r.score_tests if np.isfinite(t.smallest)]
-    scale = display_scale(r.unit, sizes or [1.0])
+    sizes = [t.smallest for t in run.diagnostics.score_tests if np.isfinite(t.smallest)]
+    scale = display_scale(run.model.unit, sizes or [1.0])
     size, detectable = f"Size [{scale.unit}]", f"Detectable [{scale.unit}]"
     rows = [
         {
-            "Test": t.name if t.unit == r.unit else f"{t.name}, per year",
+            "Test": t.name if t.unit == run.model.unit else f"{t.name}, per year",
             "Statistic (dof)": f"{number(t.statistic, 3)} ({t.dof:.4g})",
             "p": "< 1e-300" if t.p_value < 1e-300 else number(t.p_value, 2),
             size: number(t.size * scale.factor, 2),
@@ -180,9 +187,9 @@ def score_test_table(r: ReportInput) -> TextTable:
             else MISSING,
             "Result": f"found: {t.remedy}" if t.significant else "nothing found",
         }
-        for t in r.score_tests
+        for t in run.diagnostics.score_tests
     ]
-    n_found = sum(t.significant for t in r.score_tests)
+    n_found = sum(t.significant for t in run.diagnostics.score_tests)
     verb = "found" if n_found else "found nothing"
     count_of = f"{n_found} of {len(rows)}" if n_found else f"all {len(rows)}"
     return tabulated(

@@ -11,10 +11,10 @@ from matplotlib.colors import TwoSlopeNorm
 from matplotlib.patches import Rectangle
 
 from bayesdist.diagnose.holdout.validation import HoldoutValidation
-from bayesdist.report.contents import REPORT, Plot
-from bayesdist.report.context import ReportInput, needed
+from bayesdist.report.contents import REPORT, Plot, needed
 from bayesdist.report.figures.panels import chip_axes
 from bayesdist.report.figures.style import CYCLE, INK, WIDTH, new_figure
+from bayesdist.report.run import ReportedRun, mosaic_of
 from bayesdist.report.texttable import TextTable, tabulated
 from bayesdist.utils.distributions import binom_ppf
 from bayesdist.utils.numbers import count, number
@@ -29,10 +29,10 @@ _MOST_TESTS = 12
 _KEY = 3.0  # length of the arrow in the key, in sigma
 
 
-@REPORT.table("holdout", needs=("held_out.coverage",))
-def holdout_coverage(r: ReportInput) -> TextTable:
+@REPORT.table("holdout", needs=("diagnostics.holdout.coverage",))
+def holdout_coverage(run: ReportedRun) -> TextTable:
     """Table of the coverage of the held-out stars along each axis."""
-    held_out = needed(r.held_out)
+    held_out = needed(run.diagnostics.holdout)
     rows = [
         {
             "Axis": c.axis,
@@ -48,10 +48,10 @@ def holdout_coverage(r: ReportInput) -> TextTable:
     return tabulated("Coverage of the held-out stars", rows, words=(0, 1), note=note)
 
 
-@REPORT.table("holdout", needs=("held_out",))
-def holdout_table(r: ReportInput) -> TextTable:
+@REPORT.table("holdout", needs=("diagnostics.holdout",))
+def holdout_table(run: ReportedRun) -> TextTable:
     """Table of the most informative tests."""
-    stars = needed(r.held_out)
+    stars = needed(run.diagnostics.holdout)
     shown = stars.tests[:_MOST_TESTS]
     rows = [
         {
@@ -82,10 +82,12 @@ def _question(test: HeldTest, unit: str) -> str:
     }[test.name]
 
 
-@REPORT.figure("holdout", needs=("held_out",), printed=lambda r: r.words.prints_data)
-def holdout(r: ReportInput) -> Plot:
+@REPORT.figure(
+    "holdout", needs=("diagnostics.holdout",), printed=lambda run: run.kind.words.prints_data
+)
+def holdout(run: ReportedRun) -> Plot:
     """Predictive probabilities, and residuals by region in units of their prediction."""
-    stars, mosaic = needed(r.held_out), r.mosaic
+    stars, mosaic = needed(run.diagnostics.holdout), mosaic_of(run)
     rows, columns = (max(place[k] for place in mosaic.places) + 1 for k in (0, 1))
     aspect = max(ny / nx for nx, ny in mosaic.sizes)
     panel = min(0.75 * WIDTH / columns, 4.4)

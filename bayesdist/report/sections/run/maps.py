@@ -11,8 +11,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from bayesdist.assess.solution import chip_frames
+from bayesdist.assess.vectors import diagram_vectors
 from bayesdist.report.contents import REPORT, Plot
-from bayesdist.report.context import ReportInput
 from bayesdist.report.figures.arrows import (
     Arrows,
     cell_magnification,
@@ -26,6 +26,16 @@ from bayesdist.report.figures.fields import Grid, contour_levels, error_levels, 
 from bayesdist.report.figures.panels import ChipPanels, FocalPlane, Panels, overlap
 from bayesdist.report.figures.style import nice_below
 from bayesdist.report.plots.maps import BORDER, KEY_PAD
+from bayesdist.report.run import (
+    ReportedRun,
+    has_several_chips,
+    length_text,
+    marked,
+    mosaic_of,
+    position_text,
+    scale_mas,
+    shown_maps,
+)
 from bayesdist.report.sections.gauge import gauge_mark, gauge_of_maps
 from bayesdist.report.texttable import TextTable, tabulated
 from bayesdist.utils.numbers import display_scale, number, size_of, with_mas
@@ -38,12 +48,13 @@ MOST_ALONG = 34  # vectors along the longer side of a focal plane; more would ov
 
 
 @REPORT.table("maps")
-def map_table(r: ReportInput) -> TextTable:
+def map_table(run: ReportedRun) -> TextTable:
     """Table of the extremes of the uncertainty maps."""
     rows = []
-    typical = max(float(np.nanmax(m.per_axis)) for c in r.chips for m in c.maps)
-    for c in r.chips:
-        for m in c.maps:
+    shown, formal = shown_maps(run), run.evaluation.formal
+    typical = max(float(np.nanmax(m.per_axis)) for maps in shown for m in maps)
+    for chip, maps in zip(run.model.chips, shown, strict=True):
+        for m in maps:
             sizes = {
                 "Largest σ u": m.sigma_u_max,
                 "Largest σ v": m.sigma_v_max,
@@ -52,31 +63,32 @@ def map_table(r: ReportInput) -> TextTable:
                 "Largest CE68": float(np.nanmax(m.circular_error(0.68))),
                 "Largest CE95": float(np.nanmax(m.circular_error(0.95))),
             }
-            row = {k: with_mas(v, m.unit, r.scale_mas, like=typical) for k, v in sizes.items()}
+            row = {k: with_mas(v, m.unit, scale_mas(run), like=typical) for k, v in sizes.items()}
             row["At pixel"] = "({:.0f}, {:.0f})".format(*m.position_of_max)
-            if m is not c.formal_map:
-                row = {k: r.marked(text) for k, text in row.items()}
-            whose = {"Chip, solution": f"{c.chip.name}, {m.kind}"}
-            rows.append((whose if r.several else {"Solution": m.kind}) | row)
-    first = r.chips[0].formal_map
+            if m not in formal:
+                row = {k: marked(run, text) for k, text in row.items()}
+            whose = {"Chip, solution": f"{chip.name}, {m.kind}"}
+            rows.append((whose if has_several_chips(run) else {"Solution": m.kind}) | row)
+    first = formal[0]
     when = "" if first.epoch is None else f", epoch {first.epoch:.2f}"
-    chip_words = "each chip" if r.several else f"chip {first.chip}"
+    chip_words = "each chip" if has_several_chips(run) else f"chip {first.chip}"
     return tabulated(
-        f"Uncertainty of the position, 1 σ, {chip_words}{when}{gauge_mark(r)}",
+        f"Uncertainty of the position, 1 σ, {chip_words}{when}{gauge_mark(run)}",
         rows,
         note="Per axis: rms of σ u and σ v. CE68, CE95: radii of the circles that hold 68 and 95 %."
-        f" {gauge_of_maps(r)}".rstrip(),
+        f" {gauge_of_maps(run)}".rstrip(),
     )
 
 
 @REPORT.figure("maps", printed=True)
-def uncertainty_radius(r: ReportInput) -> Plot:
+def uncertainty_radius(run: ReportedRun) -> Plot:
     """Uncertainty per axis, rms of sigma_u and sigma_v, all maps in one colour scale."""
-    maps = [m for c in r.chips for m in c.maps]
-    scale = display_scale(r.unit, max(float(np.nanmax(m.per_axis)) for m in maps))
+    shown = shown_maps(run)
+    maps = [m for of_chip in shown for m in of_chip]
+    scale = display_scale(run.model.unit, max(float(np.nanmax(m.per_axis)) for m in maps))
     grids = [Grid(m.x, m.y, m.per_axis * scale.factor, m.position_of_max) for m in maps]
-    kinds = [m.kind for m in r.chips[0].maps]
-    panels = map_panels(r, len(kinds))
+    kinds = [m.kind for m in shown[0]]
+    panels = map_panels(run, len(kinds))
 
     def title(kind: str, low: float, high: float) -> str:
         return f"{kind}: {number(low)} to {number(high)}"
@@ -94,28 +106,29 @@ def uncertainty_radius(r: ReportInput) -> Plot:
         " holds 68 % has 1.51 times this as its radius where both axes are alike, that of 95 %"
         " 2.45 times."
     )
-    if r.words.relative_map:
-        text += r.words.relative_map
+    if run.kind.words.relative_map:
+        text += run.kind.words.relative_map
         return Plot(figure, "Uncertainty over the detector", text, f"Contour maps. {text}")
-    pairs = [(c.formal_map, c.posterior_map) for c in r.chips]
-    ratios = [p.radius / f.radius for f, p in pairs if p is not None]
-    if ratios:
-        low, high = (number(float(end(ratios))) for end in (np.nanmin, np.nanmax))
-        text += (
-            f" The posterior's is {low} to {high} times the formal one;"
-            " above 1, the formal errors of least squares with rejection are too small."
-        )
+    ratios = [posterior.radius / formal.radius for formal, posterior in shown]
+    low, high = (number(float(end(ratios))) for end in (np.nanmin, np.nanmax))
+    text += (
+        f" The posterior's is {low} to {high} times the formal one;"
+        " above 1, the formal errors of least squares with rejection are too small."
+    )
     return Plot(figure, "Uncertainty over the detector", text, f"Contour maps. {text}")
 
 
 @REPORT.figure("maps", printed=True)
-def distortion(r: ReportInput) -> Plot:
+def distortion(run: ReportedRun) -> Plot:
     """Vectors from each array position to where the distortion puts it.
 
     As section 4 of WSDC D-T033, with the zeroth order suppressed.
     """
-    v, position = _longest(r, "displacement")
-    notes = {c.chip.name: c.displacement.part_note for c in r.chips}
+    vectors = _vectors(run, "no_constant")
+    v, place = _longest(run, vectors)
+    notes = {
+        chip.name: of_chip.part_note for chip, of_chip in zip(run.model.chips, vectors, strict=True)
+    }
     note = v.part_note
     if len(set(notes.values())) > 2:
         note = "relative to the best similarity of each chip about its reference pixel"
@@ -125,24 +138,24 @@ def distortion(r: ReportInput) -> Plot:
         " Each chip is compared with its own array: gap and rotation between chips are not shown."
     )
     return Plot(
-        _flow(r, [c.displacement for c in r.chips]),
+        _flow(run, vectors),
         "Distortion, zeroth order suppressed",
         f"Vectors run from the array position to where the distortion puts it, {note}; the"
-        f" largest is {r.length(v.length_max)} at {position}, ringed."
-        f"{own_array_note if r.several else ''}",
-        f"Vector-flow diagram of the distortion, largest vector {r.length(v.length_max)}.",
+        f" largest is {length_text(run, v.length_max)} at {place}, ringed."
+        f"{own_array_note if has_several_chips(run) else ''}",
+        f"Vector-flow diagram of the distortion, largest vector {length_text(run, v.length_max)}.",
     )
 
 
 @REPORT.figure("maps")
-def pixel_area(r: ReportInput) -> Plot:
+def pixel_area(run: ReportedRun) -> Plot:
     """Contours of the pixel area relative to that at the reference pixel, in percent.
 
     Handbooks of cameras give the same ratio without subtracting one.
     """
-    areas = [c.area for c in r.chips]
+    areas = run.evaluation.areas
     grids = [Grid(a.x, a.y, 100.0 * (a.area - 1.0)) for a in areas]
-    panels = map_panels(r)
+    panels = map_panels(run)
     scalar_map(
         panels,
         grids,
@@ -162,16 +175,15 @@ def pixel_area(r: ReportInput) -> Plot:
     low, high = min(a.area.min() for a in areas), max(a.area.max() for a in areas)
     sigma = max(float(a.sigma.max()) for a in areas)
     of_chip, between = "", ""
-    if r.several:
+    if has_several_chips(run):
         of_chip = " of each chip"
-        first, *other_chips = r.chips
+        (first, area), *others = zip(run.model.chips, areas, strict=True)
         ratios = ", ".join(
-            f"{c.area.reference_area / first.area.reference_area:.5f} ({c.chip.name})"
-            for c in other_chips
+            f"{other.reference_area / area.reference_area:.5f} ({chip.name})"
+            for chip, other in others
         )
         between = (
-            f" The reference pixels themselves cover, relative to that of {first.chip.name}:"
-            f" {ratios}."
+            f" The reference pixels themselves cover, relative to that of {first.name}: {ratios}."
         )
     return Plot(
         panels.figure,
@@ -184,17 +196,19 @@ def pixel_area(r: ReportInput) -> Plot:
 
 
 @REPORT.figure("maps", printed=True)
-def pixel_scale(r: ReportInput) -> Plot:
+def pixel_scale(run: ReportedRun) -> Plot:
     """Map of the pixel scale, the square root of the area of each pixel."""
-    areas = [c.area for c in r.chips]
-    in_pixels = r.unit == "pix" and r.scale_mas is None
-    factor = r.scale_mas or 1.0 if r.unit == "pix" else 1.0
+    areas = run.evaluation.areas
+    in_pixels = run.model.unit == "pix" and scale_mas(run) is None
+    factor = scale_mas(run) or 1.0 if run.model.unit == "pix" else 1.0
     values = [factor * np.sqrt(a.area * a.reference_area) for a in areas]
-    scale = display_scale("mas" if r.unit == "pix" else r.unit, max(float(v.max()) for v in values))
+    scale = display_scale(
+        "mas" if run.model.unit == "pix" else run.model.unit, max(float(v.max()) for v in values)
+    )
     unit = "reference pix" if in_pixels else scale.unit
     by = 1.0 if in_pixels else scale.factor
     grids = [Grid(a.x, a.y, by * v) for a, v in zip(areas, values, strict=True)]
-    panels = map_panels(r)
+    panels = map_panels(run)
     scalar_map(
         panels,
         grids,
@@ -216,27 +230,30 @@ def pixel_scale(r: ReportInput) -> Plot:
 
 
 @REPORT.figure("maps")
-def distortion_non_linear(r: ReportInput) -> Plot:
+def distortion_non_linear(run: ReportedRun) -> Plot:
     """Vectors of the non-linear part."""
-    v, position = _longest(r, "non_linear")
+    vectors = _vectors(run, "non_linear")
+    v, place = _longest(run, vectors)
     return Plot(
-        _flow(r, [c.non_linear for c in r.chips]),
+        _flow(run, vectors),
         "Distortion, non-linear part",
         f"Only {v.part_note}: what remains beyond shift, scale, rotation and skew, at most"
-        f" {r.length(v.length_max)} at {position}, ringed.",
-        f"Vector diagram of the non-linear part, largest vector {r.length(v.length_max)}.",
+        f" {length_text(run, v.length_max)} at {place}, ringed.",
+        f"Vector diagram of the non-linear part, largest vector {length_text(run, v.length_max)}.",
     )
 
 
-def map_panels(r: ReportInput, maps: int = 1, *, colorbar: bool = True) -> Panels:
+def map_panels(run: ReportedRun, maps: int = 1, *, colorbar: bool = True) -> Panels:
     """Panels of maps: one for each chip, or one focal plane if there are many."""
-    frames = chip_frames(r.solution, epoch=r.chips[0].best_map.epoch)
-    outlines = [frame.outline(c.chip.size) for frame, c in zip(frames, r.chips, strict=True)]
-    if len(r.chips) <= MOST_PANELS or overlap(outlines):
-        panels = ChipPanels(r.mosaic, maps, colorbar=colorbar)
+    frames = chip_frames(run.posterior, epoch=run.evaluation.maps[0].epoch)
+    outlines = [
+        frame.outline(chip.size) for frame, chip in zip(frames, run.model.chips, strict=True)
+    ]
+    if len(run.model.chips) <= MOST_PANELS or overlap(outlines):
+        panels = ChipPanels(mosaic_of(run), maps, colorbar=colorbar)
         panels.frame()
         return panels
-    names = [c.chip.name or f"chip {c.chip.number}" for c in r.chips]
+    names = [chip.name or f"chip {chip.number}" for chip in run.model.chips]
     border = BORDER * float(np.ptp(np.concatenate(outlines), axis=0).max())
     look: dict[str, Any] = {"frames": frames, "margin": border, "colorbar": colorbar}
     return FocalPlane(outlines, names, maps=maps, **look)
@@ -268,24 +285,28 @@ def map_titles(
     ]
 
 
-def _flow(r: ReportInput, vectors: Sequence[VectorMap]) -> Figure:
+def _flow(run: ReportedRun, vectors: Sequence[VectorMap]) -> Figure:
     """Draw the vectors of all chips in the focal plane, in pixels for any unit of u and v.
 
     Each chip has a separate panel if the solution does not separate the chips on the sky.
     """
     lengths = [float(np.hypot(*v.on_detector).max()) for v in vectors]
-    frames = chip_frames(r.solution, epoch=r.chips[0].best_map.epoch)
-    outlines = [frame.outline(c.chip.size) for frame, c in zip(frames, r.chips, strict=True)]
+    frames = chip_frames(run.posterior, epoch=run.evaluation.maps[0].epoch)
+    outlines = [
+        frame.outline(chip.size) for frame, chip in zip(frames, run.model.chips, strict=True)
+    ]
     apart = not overlap(outlines)
     step = _every(vectors, np.ptp(np.concatenate(outlines), axis=0).max()) if apart else 1
     chips = [Arrows.of_map(v, step) for v in vectors]
     M = cell_magnification(min(arrows.step for arrows in chips), max(lengths))
     key = nice_below(max(lengths) / 1.5)
-    border = BORDER * r.mosaic.longest_side
+    border = BORDER * mosaic_of(run).longest_side
     look: dict[str, Any] = {"magnification": M, "key": key, "colored": True}
     if not apart:
-        reach = max(arrows.reach(M, c.chip.size) for arrows, c in zip(chips, r.chips, strict=True))
-        separate = ChipPanels(r.mosaic, colorbar=True)
+        reach = max(
+            arrows.reach(M, chip.size) for arrows, chip in zip(chips, run.model.chips, strict=True)
+        )
+        separate = ChipPanels(mosaic_of(run), colorbar=True)
         separate.frame(reach + border)
         titles = [
             separate.title(k, f"largest {size_of(length, digits=4)}")
@@ -295,7 +316,7 @@ def _flow(r: ReportInput, vectors: Sequence[VectorMap]) -> Figure:
         return separate.figure
     worst = int(np.argmax(lengths))
     placed = chips
-    if r.several:
+    if has_several_chips(run):
         placed = [
             arrows.placed(frame, ringed=k == worst)
             for k, (arrows, frame) in enumerate(zip(chips, frames, strict=True))
@@ -306,11 +327,11 @@ def _flow(r: ReportInput, vectors: Sequence[VectorMap]) -> Figure:
         corners.min(axis=0) - np.concatenate(ends).min(axis=0),
         np.concatenate(ends).max(axis=0) - corners.max(axis=0),
     ]
-    names = [c.chip.name or f"chip {c.chip.number}" for c in r.chips]
+    names = [chip.name or f"chip {chip.number}" for chip in run.model.chips]
     plane = FocalPlane(
         outlines, names, margin=max(float(np.max(beyond)), 0.0) + border, colorbar=True
     )
-    whose = f"{names[worst]}, " if r.several else ""
+    whose = f"{names[worst]}, " if has_several_chips(run) else ""
     vector_map(
         plane, placed, [f"{whose}largest {size_of(lengths[worst], digits=4)}"], pad=KEY_PAD, **look
     )
@@ -325,41 +346,49 @@ def _every(vectors: Sequence[VectorMap], extent: float) -> int:
     return next((k for k in divisors if extent / (k * step) <= MOST_ALONG), divisors[-1])
 
 
-def _longest(r: ReportInput, which: str) -> tuple[VectorMap, str]:
+def _vectors(run: ReportedRun, part: str) -> tuple[VectorMap, ...]:
+    """Vectors of the distortion of each chip; for `part` see `diagram_vectors`."""
+    epoch = run.evaluation.settings.epoch
+    return tuple(
+        diagram_vectors(run.solution, chip, part=part, epoch=epoch) for chip in run.model.chips
+    )
+
+
+def _longest(run: ReportedRun, vectors: Sequence[VectorMap]) -> tuple[VectorMap, str]:
     """Vectors of the chip with the longest vector, and the position of that vector as text."""
-    worst = max(r.chips, key=lambda c: getattr(c, which).length_max)
-    vectors: VectorMap = getattr(worst, which)
-    return vectors, f"pixel {r.position(vectors.position_of_max, worst.chip.number)}"
+    k = max(range(len(vectors)), key=lambda k: vectors[k].length_max)
+    place = position_text(run, vectors[k].position_of_max, run.model.chips[k].number)
+    return vectors[k], f"pixel {place}"
 
 
-@REPORT.figure("maps", when=lambda r: len(r.chips) <= MOST_PANELS)
-def formal_uncertainty(r: ReportInput) -> Plot:
+@REPORT.figure("maps", when=lambda run: len(run.model.chips) <= MOST_PANELS)
+def formal_uncertainty(run: ReportedRun) -> Plot:
     """Four vectors from each position, to (±sigma_u, ±sigma_v).
 
     As section 6 of WSDC D-T033, which draws them 2000 times larger than the
     detector.
     """
-    maps = [m for c in r.chips for m in c.maps]
+    shown = shown_maps(run)
+    maps = [m for of_chip in shown for m in of_chip]
     largest = max(m.radius_max for m in maps)
     widest = max(max(m.sigma_u_max, m.sigma_v_max) for m in maps)
-    step = max(sparse_step(maps), 2 if r.several else 1)  # panels of several chips are small
+    step = max(
+        sparse_step(maps), 2 if has_several_chips(run) else 1
+    )  # panels of several chips are small
     M = crosses_magnification(maps, step)
-    panels = ChipPanels(r.mosaic, len(r.chips[0].maps))
-    panels.frame(M * widest + BORDER * r.mosaic.longest_side)
+    panels = ChipPanels(mosaic_of(run), len(shown[0]))
+    panels.frame(M * widest + BORDER * mosaic_of(run).longest_side)
     titles = [
         panels.title(
             k, f"{m.kind}, largest {size_of(float(np.nanmax(m.per_axis)), m.unit)} per axis", ", "
         )
-        for k, c in enumerate(r.chips)
-        for m in c.maps
+        for k, of_chip in enumerate(shown)
+        for m in of_chip
     ]
     cross_map(panels, maps, titles, magnification=M, key=nice_below(largest), every=step)
-    by_kind = [
-        max(maps, key=lambda m: m.radius_max)
-        for maps in zip(*(c.maps for c in r.chips), strict=True)
-    ]
+    by_kind = [max(of_kind, key=lambda m: m.radius_max) for of_kind in zip(*shown, strict=True)]
     largest_errors = " and ".join(
-        f"{r.length(float(np.nanmax(m.per_axis)))} ({m.kind})" for m in by_kind
+        f"{length_text(run, float(np.nanmax(m.per_axis)))} ({m.kind})" for m in by_kind
     )
     return Plot(
         panels.figure,

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from bayesdist.report.contents import REPORT, Plot
-from bayesdist.report.context import ReportInput
 from bayesdist.report.figures.style import WIDTH, new_figure
 from bayesdist.report.plots.errors import plot_margins, plot_validity
+from bayesdist.report.run import ReportedRun, has_several_chips, marked
 from bayesdist.report.texttable import TextTable, tabulated
 from bayesdist.utils.numbers import (
     count,
@@ -22,11 +22,11 @@ if TYPE_CHECKING:
     from bayesdist.assess import Margin
 
 
-@REPORT.table("margins", needs=("margins",))
-def margin_table(r: ReportInput) -> TextTable:
+@REPORT.table("margins", needs=("evaluation.margins",))
+def margin_table(run: ReportedRun) -> TextTable:
     """Table of requirements and their verdicts."""
     out = []
-    for m in r.margins:
+    for m in run.evaluation.margins:
         asked = m.requirement
         spread = (m.interval[1] - m.interval[0]) / 4
         cells = {
@@ -38,17 +38,17 @@ def margin_table(r: ReportInput) -> TextTable:
         epoch = "" if m.epoch is None else f" at {m.epoch:.2f}"
         if asked.epochs is not None:
             epoch = f" from {asked.epochs[0]:.2f} to {asked.epochs[1]:.2f}, worst{epoch}"
-        chip = next((c.chip.name for c in r.chips if c.chip.number == asked.chip), "")
-        on = f" on {chip}" if chip and r.several else ""
+        chip = next((c.name for c in run.model.chips if c.number == asked.chip), "")
+        on = f" on {chip}" if chip and has_several_chips(run) else ""
         scope = f" {asked.scope}" if asked.scope else ""
         statistic = f"{asked.statistic}{scope}{on}{epoch} at most {asked.limit:g} {asked.unit}"
         out.append(
             {
                 "Name": asked.name,
                 "Requirement": f"{statistic}, with probability {asked.probability:g}",
-                **{key: r.marked(text) for key, text in cells.items()},
+                **{key: marked(run, text) for key, text in cells.items()},
                 "Unit": m.unit,
-                "Verdict": _judgement(m, r.several),
+                "Verdict": _judgement(m, has_several_chips(run)),
             }
         )
     return tabulated(
@@ -57,7 +57,7 @@ def margin_table(r: ReportInput) -> TextTable:
         words=(0, 1, 6, 7),
         stacked=(7,),
         note="Margin: the limit minus the value that the statistic stays under with the probability"
-        f" asked for. {r.words.new_exposure}".rstrip(),
+        f" asked for. {run.kind.words.new_exposure}".rstrip(),
     )
 
 
@@ -72,26 +72,26 @@ def _judgement(m: Margin, several: bool) -> str:
     return "; ".join(out + ([] if m.remedy is None else [m.remedy.sentence]))
 
 
-@REPORT.table("margins", needs=("margins",))
-def rests_on_table(r: ReportInput) -> TextTable | None:
+@REPORT.table("margins", needs=("evaluation.margins",))
+def rests_on_table(run: ReportedRun) -> TextTable | None:
     """Table of the assumptions and measurements on which the verdicts are based."""
     clauses: dict[str, list[str]] = {}
-    for m in r.margins:
+    for m in run.evaluation.margins:
         for clause in m.rests_on:
             clauses.setdefault(clause, []).append(m.requirement.name)
     if not clauses:
         return None
-    n_margins = len(r.margins)
+    n_margins = len(run.evaluation.margins)
     rows = tuple(
         (clause, "all" if len(of) == n_margins else ", ".join(of)) for clause, of in clauses.items()
     )
     return TextTable("Basis of the verdicts", ("Basis", "Requirements"), rows, words=(0, 1))
 
 
-@REPORT.figure("margins", needs=("margins",), printed=True)
-def margins(r: ReportInput) -> Plot:
+@REPORT.figure("margins", needs=("evaluation.margins",), printed=True)
+def margins(run: ReportedRun) -> Plot:
     """Each requirement's statistic in units of its own limit: its draws and their central 95 %."""
-    margins = r.margins
+    margins = run.evaluation.margins
     fig = new_figure(WIDTH, 0.9 + 0.62 * len(margins))
     plot_margins(margins, fig.subplots())
     met = sum(m.verdict == "met" for m in margins)
@@ -106,10 +106,10 @@ def margins(r: ReportInput) -> Plot:
     )
 
 
-@REPORT.figure("margins", needs=("validity",), printed=True)
-def validity_period(r: ReportInput) -> Plot:
+@REPORT.figure("margins", needs=("evaluation.validity",), printed=True)
+def validity_period(run: ReportedRun) -> Plot:
     """Probability of meeting each requirement against time, and when it becomes too low."""
-    periods = r.validity
+    periods = run.evaluation.validity
     fig = new_figure(WIDTH, 0.7 + 1.5 * len(periods))
     panels = fig.subplots(len(periods), 1, sharex=True, squeeze=False)[:, 0]
     for ax, period in zip(panels, periods, strict=True):

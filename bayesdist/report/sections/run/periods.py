@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bayesdist.report.contents import REPORT, Plot
-from bayesdist.report.context import ReportInput, needed
+from bayesdist.report.contents import REPORT, Plot, needed
 from bayesdist.report.figures.arrows import CHANCE, Arrows, magnification_of, spacing, vector_map
 from bayesdist.report.figures.panels import ChipPanels
 from bayesdist.report.figures.style import nice_below
+from bayesdist.report.run import ReportedRun, mosaic_of, on_chip, position_text, scale_mas
 from bayesdist.report.texttable import TextTable, listing, tabulated
 from bayesdist.utils.numbers import (
     MISSING,
@@ -31,14 +31,14 @@ GRID = 17  # number of vectors along the longer side
 _CLEAR = 3.0  # sigmas above which a coefficient is significant
 
 
-@REPORT.table("periods", needs=("periods",))
-def period_tables(r: ReportInput) -> tuple[TextTable, ...]:
+@REPORT.table("periods", needs=("diagnostics.periods",))
+def period_tables(run: ReportedRun) -> tuple[TextTable, ...]:
     """Tables of the verdict, the periods, coefficients of the first and last, and residuals."""
-    variation = needed(r.periods)
-    out = [_verdict(variation), _periods(variation, r), _coefficients(variation)]
+    variation = needed(run.diagnostics.periods)
+    out = [_verdict(variation), _periods(variation, run), _coefficients(variation)]
     for chip, table in zip(variation.comparison.model.chips, variation.residuals, strict=True):
-        out.append(_residuals(table, r.on_chip(chip)))
-    return (*out, _patterns(variation, r))
+        out.append(_residuals(table, on_chip(run, chip)))
+    return (*out, _patterns(variation, run))
 
 
 def _verdict(found: TimeVariation) -> TextTable:
@@ -55,8 +55,8 @@ def _verdict(found: TimeVariation) -> TextTable:
     )
 
 
-def _periods(found: TimeVariation, r: ReportInput) -> TextTable:
-    comparison, mas = found.comparison, r.scale_mas
+def _periods(found: TimeVariation, run: ReportedRun) -> TextTable:
+    comparison, mas = found.comparison, scale_mas(run)
     rows = []
     ends = (found.last, found.first, found.ends)
     each = [(name, None, found.changes[name]) for name in comparison.names]
@@ -70,10 +70,10 @@ def _periods(found: TimeVariation, r: ReportInput) -> TextTable:
                 "Period (MJD)": name if single else f"{name} against {against}",
                 "Year": f"{(start + stop) / 2:.3f}" if single else MISSING,
                 "Pairs": count(n) if single else MISSING,
-                "Largest difference": with_mas(change.largest, r.unit, mas),
-                "σ there": with_mas(change.sigma, r.unit, mas, 2),
-                "At pixel": r.position(change.at, change.chip),
-                "95 % of noise": with_mas(change.noise_95, r.unit, mas),
+                "Largest difference": with_mas(change.largest, run.model.unit, mas),
+                "σ there": with_mas(change.sigma, run.model.unit, mas, 2),
+                "At pixel": position_text(run, change.at, change.chip),
+                "95 % of noise": with_mas(change.noise_95, run.model.unit, mas),
                 "p of the largest": probability(change.p_value),
                 "p of the field": probability(change.p_field),
                 f"Coefficients beyond {_CLEAR:g} σ, largest": (
@@ -139,12 +139,12 @@ def _residuals(table: StatisticsTable, on_chip: str) -> TextTable:
     )
 
 
-def _patterns(found: TimeVariation, r: ReportInput) -> TextTable:
+def _patterns(found: TimeVariation, run: ReportedRun) -> TextTable:
     rows = []
     for chip, several in zip(found.comparison.model.chips, found.patterns, strict=True):
         for pattern in several:
-            head = f"{pattern.period}/{pattern.axis}{r.on_chip(chip)}"
-            rms = with_mas(pattern.rms, r.unit, r.scale_mas, 2)
+            head = f"{pattern.period}/{pattern.axis}{on_chip(run, chip)}"
+            rms = with_mas(pattern.rms, run.model.unit, scale_mas(run), 2)
             cells = (
                 number(pattern.p_value, 2),
                 rms,
@@ -161,15 +161,17 @@ def _patterns(found: TimeVariation, r: ReportInput) -> TextTable:
     )
 
 
-@REPORT.figure("periods", needs=("periods",), printed=lambda r: r.words.prints_data)
-def period_differences(r: ReportInput) -> Plot:
+@REPORT.figure(
+    "periods", needs=("diagnostics.periods",), printed=lambda run: run.kind.words.prints_data
+)
+def period_differences(run: ReportedRun) -> Plot:
     """Map of the latest model minus the earliest one.
 
     Vectors that noise would make as long at their position in more than 5 % of cases are pale.
     """
-    result = needed(r.periods)
+    result = needed(run.diagnostics.periods)
     comparison, unit = result.comparison, result.comparison.model.unit
-    longest = r.mosaic.longest_side
+    longest = mosaic_of(run).longest_side
     chips, lengths = [], []
     for chip in comparison.model.chips:
         nx, ny = (max(3, round(GRID * side / longest)) for side in chip.size)
@@ -180,23 +182,23 @@ def period_differences(r: ReportInput) -> Plot:
         lengths.append(float(chips[-1].length.max()))
     largest = max(lengths)
     M = magnification_of(2.0 * min(arrows.step for arrows in chips), largest)
-    panels = ChipPanels(r.mosaic)
+    panels = ChipPanels(mosaic_of(run))
     panels.frame(0.02 * longest + M * largest)
     titles = [
         panels.title(k, f"MJD {result.last} − {result.first},\nlargest {size_of(here, unit)}")
         for k, here in enumerate(lengths)
     ]
     vector_map(panels, chips, titles, magnification=M, key=nice_below(largest / 1.5), unit=unit)
-    change, mas = result.ends, r.scale_mas
-    size = with_mas(change.largest, r.unit, mas)
+    change, mas = result.ends, scale_mas(run)
+    size = with_mas(change.largest, run.model.unit, mas)
     return Plot(
         panels.figure,
         "Difference of the latest and the earliest period",
         f"Positions by the model of {result.last} minus those by the model of {result.first}. Dark"
         " vectors differ from zero beyond 2 σ at their position (both axes together); neighbours"
         f" share their coefficients and are dark together. The largest is {size} at pixel"
-        f" {r.position(change.at, change.chip)}; noise alone makes up to"
-        f" {with_mas(change.noise_95, r.unit, mas)} in 95 of 100 cases"
+        f" {position_text(run, change.at, change.chip)}; noise alone makes up to"
+        f" {with_mas(change.noise_95, run.model.unit, mas)} in 95 of 100 cases"
         f" ({probability(change.p_value)}).",
         f"Map of difference vectors between two periods; the largest is {size}.",
     )

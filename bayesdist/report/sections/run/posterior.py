@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from bayesdist.infer.catalogue.added_errors import DECISIVE
-from bayesdist.report.contents import REPORT, Plot
-from bayesdist.report.context import ReportInput, needed
+from bayesdist.report.contents import REPORT, Plot, needed
 from bayesdist.report.figures.style import WIDTH, legend_above, new_figure
 from bayesdist.report.plots.posterior import (
     MIXTURE,
@@ -18,6 +17,7 @@ from bayesdist.report.plots.posterior import (
     rank_band,
     slowest_parameters,
 )
+from bayesdist.report.run import ReportedRun, marked
 from bayesdist.report.texttable import TextTable, tabulated
 from bayesdist.utils.numbers import (
     MISSING,
@@ -37,14 +37,14 @@ _INDEPENDENCE = (
 )
 
 
-@REPORT.table("outliers", needs=("posterior",))
-def outlier_table(r: ReportInput) -> TextTable:
+@REPORT.table("outliers")
+def outlier_table(run: ReportedRun) -> TextTable:
     """Table of the parameters of the mixture, and of the number of stars or detections flagged."""
-    post, words = needed(r.posterior), r.words
+    post, words = run.posterior, run.kind.words
     named = {
         "f": (f"Fraction of {words.false_rows}, f", ""),
-        "j": ("Jitter, j: error beyond the quoted one", r.unit),
-        "s_out": (f"Scale of the {words.false_rows}, s_out", r.unit),
+        "j": ("Jitter, j: error beyond the quoted one", run.model.unit),
+        "s_out": (f"Scale of the {words.false_rows}, s_out", run.model.unit),
     }
     rows = []
     for key, (name, unit) in named.items():
@@ -56,7 +56,7 @@ def outlier_table(r: ReportInput) -> TextTable:
         low, high = np.quantile(v, [0.025, 0.975])
         sd = float(v.std())
         cells = (rounded(v.mean(), sd), number(sd, 2), interval(low, high, sd))
-        rows.append((name, *(r.marked(c) for c in cells), scale.unit))
+        rows.append((name, *(marked(run, c) for c in cells), scale.unit))
     for name, number_of in (
         (f"{words.rows.capitalize()} flagged (probability above 0.5)", count(post.n_flagged)),
         (
@@ -64,18 +64,18 @@ def outlier_table(r: ReportInput) -> TextTable:
             number(post.n_false, 4),
         ),
     ):
-        rows.append((name, r.marked(number_of), MISSING, MISSING, words.rows))
-    mixture, grouped = post.mixture, r.added_errors
+        rows.append((name, marked(run, number_of), MISSING, MISSING, words.rows))
+    mixture, grouped = post.mixture, run.added_errors
     note = f"Outlier component: {mixture.model}"
     if mixture.match_radius is not None:
-        note += f", match radius {number(mixture.match_radius)} {r.unit}"
+        note += f", match radius {number(mixture.match_radius)} {run.model.unit}"
     if mixture.jitter is not None:
-        note += f"; jitter fixed at {number(mixture.jitter)} {r.unit}"
+        note += f"; jitter fixed at {number(mixture.jitter)} {run.model.unit}"
     a, b = mixture.fraction_prior
     if mixture.jitter_scale is not None:
-        note += f"; prior of j: scale {number(mixture.jitter_scale)} {r.unit}"
+        note += f"; prior of j: scale {number(mixture.jitter_scale)} {run.model.unit}"
     if mixture.outlier_scale is not None:
-        note += f"; prior of s_out: about {number(mixture.outlier_scale)} {r.unit}"
+        note += f"; prior of s_out: about {number(mixture.outlier_scale)} {run.model.unit}"
     note += "." if mixture.model == "none" else f"; prior of f: Beta({a:g}, {b:g})."
     if mixture.model != "none":
         errors = "errors of f and s_out are" if "s_out" in post.hyper else "error of f is"
@@ -95,10 +95,10 @@ def outlier_table(r: ReportInput) -> TextTable:
 
 
 @REPORT.table("outliers", needs=("added_errors",))
-def added_errors_table(r: ReportInput) -> TextTable:
+def added_errors_table(run: ReportedRun) -> TextTable:
     """Table of errors in addition to the quoted ones, in the groups that the evidence supports."""
-    added = needed(r.added_errors)
-    scale = display_scale(r.unit, added.sigma)
+    added = needed(run.added_errors)
+    scale = display_scale(run.model.unit, added.sigma)
     rows = []
     for g, label in enumerate(added.labels):
         for a, axis in enumerate("uv" if added.by_axis else ("u and v",)):
@@ -125,16 +125,17 @@ def added_errors_table(r: ReportInput) -> TextTable:
 
 
 @REPORT.figure("outliers", needs=("posterior.hyper",), folded=True)
-def outliers_corner(r: ReportInput) -> Plot:
+def outliers_corner(run: ReportedRun) -> Plot:
     """Corner plot of the outlier fraction, jitter and outlier scale, of those that were sampled."""
-    posterior = needed(r.posterior)
+    posterior = run.posterior
     columns = [mixture_column(posterior, name) for name in MIXTURE if name in posterior.hyper]
     side = WIDTH if len(columns) > 3 else 1.6 * len(columns) + 0.9
     figure = new_figure(side, side)
     draw_corner(figure, columns)
     text = "Joint posterior of the mixture's parameters; dashed lines hold 68 %."
     if "f" in posterior.hyper:
-        text += f" The fraction of {r.words.false_rows} is {percent(r.sampled_mean('f'))}."
+        fraction = float(np.mean(posterior.hyper["f"]))
+        text += f" The fraction of {run.kind.words.false_rows} is {percent(fraction)}."
     return Plot(
         figure,
         "Outlier fraction, jitter and outlier scale",
@@ -143,16 +144,16 @@ def outliers_corner(r: ReportInput) -> Plot:
     )
 
 
-@REPORT.figure("coefficients", needs=("posterior",), folded=True)
-def correlations(r: ReportInput) -> Plot:
+@REPORT.figure("coefficients", folded=True)
+def correlations(run: ReportedRun) -> Plot:
     """Matrix of the correlations between coefficients, as a map of colours."""
-    posterior = needed(r.posterior)
+    posterior = run.posterior
     names, matrix = correlation_matrix(posterior)
     fig = new_figure(0.72 * WIDTH, 0.62 * WIDTH, layout="compressed")
     plot_correlations(posterior, fig.subplots())
     upper = np.triu(np.abs(matrix), k=1)
     i, j = np.unravel_index(int(upper.argmax()), upper.shape)
-    sd, formal = np.sqrt(np.diag(posterior.cov)), np.sqrt(np.diag(r.fit.cov))
+    sd, formal = np.sqrt(np.diag(posterior.cov)), np.sqrt(np.diag(run.fit.cov))
     ratio = number(float(np.median(sd[formal > 0] / formal[formal > 0])))
     pair = (
         f"the strongest correlation is {number(float(matrix[i, j]), 2)}, of {names[i]} and"
@@ -171,11 +172,11 @@ def correlations(r: ReportInput) -> Plot:
     )
 
 
-@REPORT.figure("coefficients", needs=("posterior",), folded=True)
-def ranks(r: ReportInput) -> Plot:
+@REPORT.figure("coefficients", folded=True)
+def ranks(run: ReportedRun) -> Plot:
     """Ranks of the draws of each ensemble among all, of the slowest parameters and f, j, s_out."""
-    posterior = needed(r.posterior)
-    names = list(slowest_parameters(posterior, without=r.held))
+    posterior = run.posterior
+    names = list(slowest_parameters(posterior, without=run.held_parameters))
     names += [name for name in MIXTURE if name in posterior.hyper]
     columns = min(4, len(names))
     lines = -(-len(names) // columns)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from bayesdist.report.contents import REPORT, Plot
-from bayesdist.report.context import ReportInput
 from bayesdist.report.figures.commands import difference_vectors
+from bayesdist.report.run import ReportedRun, scale_mas
 from bayesdist.report.texttable import TextTable, tabulated
 from bayesdist.utils.numbers import MISSING, number, percent, with_mas
 
@@ -19,17 +19,18 @@ ERRORS = {
 
 
 @REPORT.table("previous", needs=("previous",))
-def previous_table(r: ReportInput) -> TextTable:
+def previous_table(run: ReportedRun) -> TextTable:
     """Table of the difference of each chip, its significance, and what was removed."""
     rows = []
-    for comparison in r.previous:
-        mas = comparison.frame.pixel_mas or r.scale_mas
+    for comparison in run.previous:
+        mas = comparison.frame.pixel_mas or scale_mas(run)
         field, similarity = comparison.field, comparison.similarity
         verdict = {True: "differs", False: "within the errors", None: "not tested"}[
             comparison.differs
         ]
         chip = next(
-            (c.chip for c in r.chips if c.chip.number == comparison.a.chip), r.chips[0].chip
+            (c for c in run.model.chips if c.number == comparison.a.chip),
+            run.model.chips[0],
         )
         shift = None if similarity.shift is None else float(np.hypot(*similarity.shift))
         scale = percent(similarity.scale - 1.0, 2) if similarity.same_unit else MISSING
@@ -49,7 +50,7 @@ def previous_table(r: ReportInput) -> TextTable:
                 "Result": verdict,
             }
         )
-    first = r.previous[0]
+    first = run.previous[0]
     return tabulated(
         f"This run minus {first.b.name}",
         rows,
@@ -61,13 +62,13 @@ def previous_table(r: ReportInput) -> TextTable:
 
 
 @REPORT.figure("previous", needs=("previous",), printed=True)
-def previous_difference(r: ReportInput) -> Plot:
+def previous_difference(run: ReportedRun) -> Plot:
     """Vectors of the run minus the release that it replaces, without shift, rotation and scale."""
-    worst = max(r.previous, key=lambda found: found.largest)
-    size = with_mas(worst.largest, "pix", worst.frame.pixel_mas or r.scale_mas)
+    worst = max(run.previous, key=lambda found: found.largest)
+    size = with_mas(worst.largest, "pix", worst.frame.pixel_mas or scale_mas(run))
     shades = " Shades are the significance of each position separately." if worst.field else ""
     return Plot(
-        difference_vectors(r.previous, names=("this run", "previous")),
+        difference_vectors(run.previous, names=("this run", "previous")),
         "Difference from the previous release",
         f"Vectors of this run minus {worst.b.name}, at most {size}, after shift, rotation and scale"
         f" between both.{shades}",

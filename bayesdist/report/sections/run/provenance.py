@@ -5,15 +5,18 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+import shlex
 from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from bayesdist.report.contents import REPORT
-from bayesdist.report.context import ReportInput
+from bayesdist.report.run import ReportedRun
 from bayesdist.report.texttable import Level, TextTable, check_cells, listing, moment, short_paths
+from bayesdist.utils.checks import Check
 from bayesdist.utils.numbers import MISSING, count, number, percent
 
 _BLANK = "_" * 24  # to be filled in on paper
@@ -21,17 +24,44 @@ _DETAILS = ("stages", "timings", "versions")  # not printed; each page names the
 _PRINTED = {"inputs": 4}  # number of rows on paper
 
 
-@REPORT.table("products", needs=("products",))
-def product_table(r: ReportInput) -> TextTable:
+def written_files(run: ReportedRun) -> tuple[Mapping[str, Any], ...]:
+    """Files that the run wrote, as in summary.json: 'path', 'kind', 'findings' and others."""
+    return tuple(run.summary.get("products", ()))
+
+
+def checks_of_file(written: Mapping[str, Any]) -> tuple[Check, ...]:
+    """Checks of a product after it was written."""
+    named = {
+        "closure_pix": "worst closure of the inverse (pix)",
+        "a_dmax": "A_DMAX (pix)",
+        "b_dmax": "B_DMAX (pix)",
+    }
+    values = {name: written.get(key) for key, name in named.items()}
+    if sky := written.get("sky"):
+        values[f"rms distance from RA, Dec of {sky['n']} stars (arcsec)"] = sky["rms_arcsec"]
+        values["largest distance from the solution (arcsec)"] = sky["solution_arcsec"]
+    out = [Check("Products", name, size) for name, size in values.items() if size is not None]
+    levels = {"error": "fail", "warning": "warn", "note": "note"}
+    for finding in written["findings"]:
+        level, _, text = finding.partition(": ")
+        # the finding is the sentence, and the headline names the criterion
+        name = "reading by other programs"
+        out.append(Check("Products", name, text, "", levels.get(level, "note")))
+    return tuple(out)
+
+
+@REPORT.table("products", when=lambda run: bool(written_files(run)))
+def product_table(run: ReportedRun) -> TextTable:
     """Table of files with their checks; an outcome that several files share is one row."""
     files_by_outcome: dict[tuple[str, ...], list[str]] = {}  # by the outcome of a check
-    for product in r.products:
-        for check in product.checks:
-            files_by_outcome.setdefault((check.name, *check_cells(check)), []).append(product.path)
+    written = {str(row["path"]): row for row in written_files(run)}
+    for path, row in written.items():
+        for check in checks_of_file(row):
+            files_by_outcome.setdefault((check.name, *check_cells(check)), []).append(path)
     rows: list[tuple[str, ...]] = []
-    for product in r.products:
-        own_rows = [cells for cells, files in files_by_outcome.items() if files == [product.path]]
-        head = product.path, product.what
+    for path, row in written.items():
+        own_rows = [cells for cells, files in files_by_outcome.items() if files == [path]]
+        head = path, str(row["kind"])
         for cells in own_rows or [(MISSING, MISSING, MISSING, Level("note"))]:
             rows.append((*head, *cells))
             head = "", ""
@@ -43,10 +73,10 @@ def product_table(r: ReportInput) -> TextTable:
 
 
 @REPORT.table("provenance")
-def document_tables(r: ReportInput) -> tuple[TextTable, ...]:
+def document_tables(run: ReportedRun) -> tuple[TextTable, ...]:
     """Tables that identify and release a copy: document id, hash, signatures."""
-    digest = config_hash(r)
-    document = {"Document id": document_id(r), "SHA-256 of the resolved configuration": digest}
+    digest = config_hash(run)
+    document = {"Document id": document_id(run), "SHA-256 of the resolved configuration": digest}
     rows = tuple((role, _BLANK, _BLANK, _BLANK) for role in ("Prepared", "Reviewed", "Approved"))
     heads = ("Role", "Name", "Date", "Signature")
     return (
@@ -55,39 +85,40 @@ def document_tables(r: ReportInput) -> tuple[TextTable, ...]:
     )
 
 
-def config_hash(r: ReportInput) -> str:
+def config_hash(run: ReportedRun) -> str:
     """SHA-256 of the resolved configuration, independent of the order of its keys."""
-    text = json.dumps(r.config, sort_keys=True, default=str)
+    text = json.dumps(run.configuration, sort_keys=True, default=str)
     return hashlib.sha256(text.encode("utf-8")).hexdigest()
 
 
-def document_id(r: ReportInput) -> str:
+def document_id(run: ReportedRun) -> str:
     """Name of the calibration, day of the run, and eight digits from configuration and start.
 
     Every run has a different id, and all reports of a run have the same one.
     """
-    began = str(r.provenance.get("created", ""))
-    digest = hashlib.sha256(f"{config_hash(r)} {began}".encode()).hexdigest()[:8]
-    name = re.sub(r"[^A-Za-z0-9]+", "-", r.name).strip("-") or "calibration"
+    began = str(run.provenance.get("created", ""))
+    digest = hashlib.sha256(f"{config_hash(run)} {began}".encode()).hexdigest()[:8]
+    name = re.sub(r"[^A-Za-z0-9]+", "-", run.title).strip("-") or "calibration"
     return "-".join(part for part in (name, began[:10].replace("-", ""), digest) if part)
 
 
 @REPORT.table("provenance")
-def provenance_tables(r: ReportInput) -> tuple[TextTable, ...]:
+def provenance_tables(run: ReportedRun) -> tuple[TextTable, ...]:
     """Tables of the provenance: single values, followed by a table for each group."""
-    single = {k: _plain(v) for k, v in r.provenance.items() if not isinstance(v, Mapping)}
-    if r.posterior is not None:
-        s = r.posterior.sampler
-        single["sampler"] = (
-            f"{s.method}; {s.ensembles} ensembles of {s.walkers} walkers, {count(s.steps)} steps,"
-            f" {count(s.passes)} passes over the data, acceptance {percent(s.acceptance, 2)},"
-            f" {number(s.wall_s)} s, seed {s.seed}"
-        )
+    single = {k: _plain(v) for k, v in run.provenance.items() if not isinstance(v, Mapping)}
+    s = run.posterior.sampler
+    single["sampler"] = (
+        f"{s.method}; {s.ensembles} ensembles of {s.walkers} walkers, {count(s.steps)} steps,"
+        f" {count(s.passes)} passes over the data, acceptance {percent(s.acceptance, 2)},"
+        f" {number(s.wall_s)} s, seed {s.seed}"
+    )
     if "created" in single:
         single["created"] = moment(single["created"])
+    if "command" in single:
+        single["command"] = _without_folders(single["command"])
     named = {k[:1].upper() + k[1:]: v for k, v in single.items()}
     out = [listing("Run", named)] if named else []
-    for key, value in r.provenance.items():
+    for key, value in run.provenance.items():
         if isinstance(value, Mapping):
             unit = " [s]" if key == "timings" else ""
             shown = _stage if key == "stages" else _plain
@@ -100,6 +131,15 @@ def provenance_tables(r: ReportInput) -> tuple[TextTable, ...]:
             )
             out.append(replace(table, folded=key in _DETAILS))
     return tuple(out)
+
+
+def _without_folders(command: str) -> str:
+    """Command line without the folders of absolute paths, which run.json has."""
+    try:
+        words = shlex.split(command)
+    except ValueError:  # it was changed since it was recorded
+        return command
+    return shlex.join(Path(word).name if Path(word).is_absolute() else word for word in words)
 
 
 def _stage(note: Mapping[str, Any]) -> str:
@@ -119,10 +159,10 @@ def _plain(value: Any) -> str:
 
 
 @REPORT.table("provenance")
-def config_table(r: ReportInput) -> TextTable | None:
+def config_table(run: ReportedRun) -> TextTable | None:
     """Table of the resolved configuration, with one row per key."""
     pairs: dict[str, str] = {}
-    for section, value in r.config.items():
+    for section, value in run.configuration.items():
         if isinstance(value, Mapping):
             pairs.update({f"{section}.{key}": _plain(v) for key, v in value.items()})
         elif isinstance(value, list | tuple):  # blocks: [[budget]], [[requirement]], [[chip]]

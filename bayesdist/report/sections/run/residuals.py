@@ -10,7 +10,6 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from bayesdist.report.contents import REPORT, Plot
-from bayesdist.report.context import ReportInput
 from bayesdist.report.figures.arrows import CHANCE, Arrows, significant_cells, vector_map
 from bayesdist.report.figures.mosaic import Mosaic
 from bayesdist.report.figures.panels import ChipPanels, FocalPlane, Panels
@@ -25,6 +24,7 @@ from bayesdist.report.plots.residuals import (
     significant,
     vector_scale,
 )
+from bayesdist.report.run import ReportedRun, mosaic_of, sample_words, shown_residuals
 from bayesdist.report.sections.run.maps import map_panels
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.numbers import display_scale
@@ -34,30 +34,24 @@ if TYPE_CHECKING:
 
 
 @REPORT.figure("fit")
-def residual_histogram(r: ReportInput) -> Plot:
+def residual_histogram(run: ReportedRun) -> Plot:
     """Histograms of the two axes: the core, and everything on a logarithmic scale of counts."""
-    words = r.words
-    if r.posterior is None:
-        text = (
-            "The line is what the quoted errors alone predict;"
-            f" {words.rows} above it in the wings are outliers."
-        )
-    else:
-        text = (
-            f"The line is the fitted mixture summed over the {words.rows}' own errors"
-            f"{words.leverage}, not a fit to the bars: it should follow them in the core (top)"
-            " and in the wings (bottom, logarithmic)."
-        )
-        if r.posterior.mixture.model != "none":
-            text += f" The dashed part is {words.false_rows}."
-    if r.sample:
-        text += f" Drawn from {r.sample}."
+    words = run.kind.words
+    text = (
+        f"The line is the fitted mixture summed over the {words.rows}' own errors"
+        f"{words.leverage}, not a fit to the bars: it should follow them in the core (top)"
+        " and in the wings (bottom, logarithmic)."
+    )
+    if run.posterior.mixture.model != "none":
+        text += f" The dashed part is {words.false_rows}."
+    if sample_words(run):
+        text += f" Drawn from {sample_words(run)}."
     return Plot(
         _histograms(
-            r.stars.residual,
-            mixture_curves(r.stars, r.fit, r.posterior),
-            unit=r.unit,
-            sampled=r.stars.partial,
+            run.diagnostics.sample.residual,
+            mixture_curves(run.diagnostics.sample, run.fit, run.posterior),
+            unit=run.model.unit,
+            sampled=run.diagnostics.sample.partial,
             rows=words.rows,
         ),
         "Residual histograms",
@@ -93,23 +87,23 @@ def _histograms(
     return fig
 
 
-@REPORT.figure("fit", printed=lambda r: r.words.prints_data)
-def residual_vectors(r: ReportInput) -> Plot:
+@REPORT.figure("fit", printed=lambda run: run.kind.words.prints_data)
+def residual_vectors(run: ReportedRun) -> Plot:
     """Mean residual vector of each cell of the detector; pale ones are what noise would give."""
-    binned = [c.binned for c in r.chips]
-    plane = map_panels(r, colorbar=False)
+    binned = shown_residuals(run)
+    plane = map_panels(run, colorbar=False)
     panels = (
-        _in_plane(binned, plane, unit=r.unit)
+        _in_plane(binned, plane, unit=run.model.unit)
         if isinstance(plane, FocalPlane)
-        else residual_panels(binned, r.mosaic, unit=r.unit)
+        else residual_panels(binned, mosaic_of(run), unit=run.model.unit)
     )
-    filled = sum(int((np.asarray(c.binned.count) > 0).sum()) for c in r.chips)
-    significant = sum(int(significant_cells(c.binned).sum()) for c in r.chips)
+    filled = sum(int((np.asarray(cells.count) > 0).sum()) for cells in binned)
+    significant = sum(int(significant_cells(cells).sum()) for cells in binned)
     chance = CHANCE * filled
-    axes, note, cannot = "", r.words.residuals, "the polynomial cannot follow"
-    if r.fit.model.frames not in ("none", "shift"):  # they turn u and v
+    axes, note, cannot = "", run.kind.words.residuals, "the polynomial cannot follow"
+    if run.model.frames not in ("none", "shift"):  # they turn u and v
         axes = ", along the axes of the polynomials, before the exposures' frames turn them"
-    if r.tables:
+    if run.tables.tables:
         cannot = "neither tables nor polynomial follow"
         if significant < chance / 2:
             note += " They are fewer than by chance, as the tables follow these very stars."

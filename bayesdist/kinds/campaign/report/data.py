@@ -1,7 +1,9 @@
-"""Content that a campaign adds to the report of a run."""
+"""Data that the figures of a campaign draw: markers, outlines, residuals and linear terms."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,67 +12,152 @@ from astropy.table import Table
 from bayesdist.app.run import Run
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data.preparing import motion_error_line
-from bayesdist.diagnose.residuals.binned import binned_residuals
+from bayesdist.diagnose.residuals.binned import BinnedResiduals, binned_residuals
 from bayesdist.files.tables import read_ecsv
-from bayesdist.infer import GaussianPriors, LinearFit, Posterior, fit_linear
+from bayesdist.infer import Posterior, fit_linear
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.nodes import corrected_matches, inside_chips, pixel_shifts
 from bayesdist.infer.solution.linear import Rejection
 from bayesdist.kinds.campaign.inputs import Inputs
 from bayesdist.kinds.campaign.matched import affine_model_of, is_mirrored
-from bayesdist.model import DistortionModel
+from bayesdist.model import Chip, DistortionModel
 from bayesdist.model.grid import outline_pixels
-from bayesdist.report.context import (
-    PAIRED,
-    CampaignResults,
-    CatalogStars,
-    ChipResiduals,
-    Detections,
-    Footprints,
-    LinearSeries,
-)
+from bayesdist.report.run import ReportedRun
+from bayesdist.utils.arrays import Bool, Float, Int
 
 MAX_MARKERS = 20_000  # markers in a figure: more would only overlap
 CELL_PIX = 64.0  # pixels: node spacing of ACS ISR 2015-06
 MIN_STARS_PER_CELL = 20  # median number of stars that a cell should have
-HELD_BY_PRIOR = 0.99  # ratio to the prior sigma above which the data determine nothing
 WIDEST_CELL = 8  # largest factor on the size of cells
 
 
-def report_fields(run: Run) -> dict[str, Any]:
-    """Fields of the content of the report: catalogue, tables and series, and the words."""
+@dataclass(frozen=True, eq=False)
+class CatalogStars:
+    """Quoted errors of the catalogue, and the limit above which its proper motions are not used."""
+
+    mag: Float  # (N,), instrumental
+    sigma: Float | None  # (N,), errors of the positions, hypot of both axes
+    sigma_motion: Float | None  # (N,), errors of the proper motions, the larger axis
+    limit: tuple[Float, Float] | None  # magnitudes and largest errors used; None for no limit
+    unit: str
+    n_used: int  # number of selected stars
+
+
+@dataclass(frozen=True, eq=False)
+class Detections:
+    """Quality of the detections, and the selection cuts."""
+
+    mag: Float  # (N,), of the detections that are drawn
+    q: Float  # (N,)
+    kept: Bool  # (N,), True if they pass the cuts
+    n_total: int  # number of all detections
+    n_kept: int  # number of all detections that pass the cuts
+    mag_cuts: tuple[float, ...]  # limits in magnitude
+    q_max: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class Footprints:
+    """Positions of the exposures on the catalogue."""
+
+    u: Float  # (N,), catalogue stars
+    v: Float
+    outlines: tuple[Float, ...]  # (M, 2), closed, of each chip in each exposure
+    epoch: Float  # of each outline
+    unit: str
+
+
+@dataclass(frozen=True, eq=False)
+class ChipResiduals:
+    """Residuals on one chip, without look-up tables and, if there are any, with them.
+
+    In both cases the polynomial and a linear map of each exposure are fitted. Residuals (N, 2) are
+    data minus model of the same matches in pixels, rotated to the detector axes, because exposures
+    have different rolls and effects of the detector are visible only along x and y.
+    """
+
+    chip: Chip
+    without: Float
+    with_tables: Float | None
+    binned_without: BinnedResiduals
+    binned_with: BinnedResiduals | None  # in the same cells
+
+
+@dataclass(frozen=True, eq=False)
+class LinearSeries:
+    """Linear terms of the exposures, each fitted separately."""
+
+    exposures: Table  # content of series.ecsv
+    drift: Table  # content of drift.ecsv
+    vafactor: Float  # (E,)
+    pa_v3: Float  # (E,), degrees, NaN if unknown
+    breaks: tuple[float, ...]
+
+    @property
+    def epoch(self) -> Float:
+        """Epochs of the exposures."""
+        return np.asarray(self.exposures["epoch"], float)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Names of the terms with their chips, 'WFC1.A_2'."""
+        names = self.exposures.colnames
+        return tuple(n for n in names if f"sigma_{n}" in names)
+
+    @property
+    def segment(self) -> Int:
+        """Segment of each exposure, from 0."""
+        return np.searchsorted(np.asarray(self.breaks, float), self.epoch, side="right")
+
+    @property
+    def outlying(self) -> Bool:
+        """Mask of the exposures that are more likely outliers than not."""
+        return np.asarray(self.exposures["outlier_probability"], float) > 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class CampaignData:
+    """What the figures and tables of a campaign show in addition to the artefacts of its run."""
+
+    filter: str
+    matching: Table  # content of matching.ecsv
+    catalog: CatalogStars | None = None
+    detections: Detections | None = None
+    footprints: Footprints | None = None
+    residuals: tuple[ChipResiduals, ...] = ()
+    series: LinearSeries | None = None
+
+
+def data_of_campaign(run: Run) -> CampaignData:
+    """Data of the figures, prepared once, because star lists and catalogue are large."""
     inputs: Inputs = run.inputs
-    directory, posterior = run.directory, run.posterior
-    matching = read_ecsv(directory / "matching.ecsv")
-    results = CampaignResults(
-        summary=dict(directory.summary),
+    matching = read_ecsv(run.directory / "matching.ecsv")
+    return CampaignData(
         filter=inputs.filter,
         matching=matching,
-        chips=tuple(posterior.model.chips),
-        unit=posterior.unit,
         catalog=_catalog_stars(inputs, matching),
-        centroids=run.errors.by_magnitude,
         detections=_detections(inputs),
-        footprints=_footprints(posterior, inputs, is_mirrored(run.match_facts)),
+        footprints=_footprints(run.posterior, inputs, is_mirrored(run.match_facts)),
         residuals=_residuals(run),
-        series=_series(directory, run.model, matching),
-        overlap=run.diagnostics.overlap,
+        series=_series(run.directory, run.model, matching),
     )
-    held = frozenset(held_parameters(run.fit, run.priors))
-    return {"campaign": results, "held": held, "words": PAIRED}
 
 
-def held_parameters(fit: LinearFit, priors: GaussianPriors) -> tuple[str, ...]:
-    """Names of coefficients and rates that are determined by their prior rather than by the data.
+def campaign_data(run: ReportedRun) -> CampaignData:
+    """Data of the figures of a run, which is a campaign."""
+    data: CampaignData = run.report_data
+    return data
 
-    Deviations of single exposures are not included, because their prior is the measured scatter.
-    """
-    share = fit.sigma * np.sqrt(priors.precision)
-    return tuple(
-        p.name
-        for p, ratio in zip(fit.model.parameters, share, strict=True)
-        if p.kind != "frame" and ratio > HELD_BY_PRIOR
-    )
+
+def summary_section(run: ReportedRun, name: str) -> Mapping[str, Any]:
+    """Section of summary.json; empty if there is none."""
+    section: Mapping[str, Any] = run.summary.get(name) or {}
+    return section
+
+
+def chip_name(run: ReportedRun, number: int) -> str:
+    """Name of a chip."""
+    return next(c.name or f"chip {number}" for c in run.model.chips if c.number == number)
 
 
 def _spread_rows(n: int, most: int) -> slice:

@@ -11,9 +11,15 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
-from bayesdist.report.contents import REPORT, Plot
-from bayesdist.report.context import CampaignResults, LinearSeries, ReportInput, needed
+from bayesdist.kinds.campaign.report.data import (
+    LinearSeries,
+    campaign_data,
+    chip_name,
+    summary_section,
+)
+from bayesdist.report.contents import REPORT, Plot, needed
 from bayesdist.report.figures.style import CYCLE, INK, WIDTH, guide_lines, legend_above, new_figure
+from bayesdist.report.run import ReportedRun
 from bayesdist.utils.arrays import Bool, Float
 from bayesdist.utils.numbers import count, display_scale, number, size_of
 
@@ -102,9 +108,11 @@ def terms_of(series: LinearSeries) -> dict[str, tuple[str, ...]]:
 
 def course_of(series: LinearSeries, lines: Sequence[Mapping[str, Any]], label: str) -> TermCourse:
     """Term of the exposures with its lines; `lines`: `time_dependence.lines` of summary.json."""
-    rows = sorted((r for r in lines if r["term"] == label), key=lambda r: int(r["segment"]))
+    rows = sorted(
+        (row for row in lines if row["term"] == label), key=lambda row: int(row["segment"])
+    )
     alpha, beta, epoch0 = (
-        np.array([np.nan if r[k] is None else r[k] for r in rows], float)
+        np.array([np.nan if row[k] is None else row[k] for row in rows], float)
         for k in ("alpha", "beta", "epoch0")
     )
     s = np.minimum(series.segment, len(rows) - 1)
@@ -149,9 +157,9 @@ ABREAST = 2  # number of chips in a figure
 FALLS = 1.2  # ratio of the scatter before and after correction, above which aberration is visible
 
 
-def _figures(r: ReportInput) -> Mapping[str, tuple[str, int]]:
+def _figures(run: ReportedRun) -> Mapping[str, tuple[str, int]]:
     """Names of figures, each with its term and the number of its group of chips."""
-    series = needed(needed(r.campaign).series)
+    series = needed(campaign_data(run).series)
     return {
         f"series_{term}" + (f"_{n + 1}" if n else ""): (term, n)
         for term, labels in terms_of(series).items()
@@ -159,19 +167,19 @@ def _figures(r: ReportInput) -> Mapping[str, tuple[str, int]]:
     }
 
 
-@REPORT.figure("campaign-time", needs=("campaign.series",), each=_figures)
-def series(r: ReportInput, which: tuple[str, int]) -> Plot:
+@REPORT.figure("campaign-time", needs=("report_data.series",), each=_figures)
+def series(run: ReportedRun, which: tuple[str, int]) -> Plot:
     """A term of some chips: as measured, without aberration with its lines, and without drift.
 
     Against time, and against PA_V3 where it is known: Figures 14 to 24 of Kozhurina-Platais et al.
     (2015).
     """
-    campaign, (term, n) = needed(r.campaign), which
-    series, unit = needed(campaign.series), campaign.unit
-    section = campaign.section("time_dependence")
+    term, n = which
+    series, unit = needed(campaign_data(run).series), run.model.unit
+    section = summary_section(run, "time_dependence")
     labels = terms_of(series)[term][ABREAST * n : ABREAST * (n + 1)]
     courses = [course_of(series, section.get("lines", []), label) for label in labels]
-    first = which == next(iter(_figures(r).values()))
+    first = which == next(iter(_figures(run).values()))
     with_roll = bool(np.isfinite(series.pa_v3).any())
     columns = 2 if with_roll else 1
     ratios = ((2.0, 1.0) if with_roll else (2.0,)) * len(courses)
@@ -198,7 +206,7 @@ def series(r: ReportInput, which: tuple[str, int]) -> Plot:
     )
     verdicts = {row["term"]: row["claim"] for row in section.get("verdicts", ())}
     falls = all(course.rms_raw > FALLS * course.rms for course in courses)
-    text = _how_to_read(campaign, with_roll) if first else "As the figure before."
+    text = _how_to_read(run, with_roll) if first else "As the figure before."
     text += (
         " Without velocity aberration the scatter about the lines"
         f" {'falls' if falls else 'hardly changes'}:"
@@ -218,13 +226,15 @@ def series(r: ReportInput, which: tuple[str, int]) -> Plot:
     )
 
 
-def _how_to_read(c: CampaignResults, with_roll: bool) -> str:
+def _how_to_read(run: ReportedRun, with_roll: bool) -> str:
     places = ", left against time and right against PA_V3" if with_roll else ""
-    g = c.section("gauge")
+    g = summary_section(run, "gauge")
     gauge = ""
     if g:
         fixed = ", ".join(g["fixed"])
-        gauge = f", shifted and turned so that {fixed} of {c.chip_name(g['chip'])} are zero in it"
+        gauge = (
+            f", shifted and turned so that {fixed} of {chip_name(run, g['chip'])} are zero in it"
+        )
     return (
         f"Each exposure fitted by itself{gauge}, with formal errors{places}. Top: as measured."
         " Middle: velocity aberration taken out, with the line of each segment, its 68 % band and"

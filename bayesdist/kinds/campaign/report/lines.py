@@ -6,9 +6,10 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
+from bayesdist.kinds.campaign.report.data import campaign_data, chip_name, summary_section
+from bayesdist.kinds.campaign.report.series import name_of_scatter, name_of_term
 from bayesdist.report.contents import REPORT
-from bayesdist.report.context import CampaignResults, ReportInput, needed
-from bayesdist.report.sections.campaign.series import name_of_scatter, name_of_term
+from bayesdist.report.run import ReportedRun
 from bayesdist.report.texttable import TextTable, listing
 from bayesdist.utils.numbers import MISSING, count, display_scale, interval, number, rounded
 
@@ -19,33 +20,33 @@ _SIGNIFICANT = 3.0  # sigmas
 FIXED = 5e-3  # 10^-6, or 10^-3 of a length; a term with a smaller error is held fixed
 
 
-@REPORT.table("campaign-time", needs=("campaign",))
-def time_tables(r: ReportInput) -> Iterator[TextTable]:
+@REPORT.table("campaign-time")
+def time_tables(run: ReportedRun) -> Iterator[TextTable]:
     """Tables of the gauge, lines of each term, changes at the breaks, scatter and claims."""
-    c = needed(r.campaign)
-    section, joint = c.section("time_dependence"), c.summary.get("lines") or []
-    names = {chip.number: chip.name for chip in c.chips}
-    published = published_terms(r.config, c.filter, tuple(names.values()))
-    if c.section("gauge"):
-        yield _gauge(c)
+    data = campaign_data(run)
+    section, joint = summary_section(run, "time_dependence"), run.summary.get("lines") or []
+    names = {chip.number: chip.name for chip in run.model.chips}
+    published = published_terms(run.configuration, data.filter, tuple(names.values()))
+    if summary_section(run, "gauge"):
+        yield _gauge(run)
     terms = dict.fromkeys(row["term"] for row in joint)
     alone = {
         (row["term"], row["segment"]): row
         for row in section.get("lines", ())
         if row["alpha"] is not None
     }
-    note = _why_errors_differ(c) if alone else ""
+    note = _why_errors_differ(run) if alone else ""
     for term in [t for t in TERMS if t in terms]:
-        rows = [row for row in joint if row["term"] == term and _is_free(row, c.unit)]
+        rows = [row for row in joint if row["term"] == term and _is_free(row, run.model.unit)]
         rows.sort(key=lambda row: (row["segment"], names[row["chip"]]))
         if rows:
-            table = _line_table(term, rows, names, alone, published.get(term), c)
+            table = _line_table(term, rows, names, alone, published.get(term), run)
             yield replace(table, note=" ".join(text for text in (table.note, note) if text))
             note = ""  # shown once, under the first of them
     if section.get("breaks"):
-        yield _changes(section["breaks"], c.unit)
-    if c.section("scatter"):
-        yield _scatter(c)
+        yield _changes(section["breaks"], run.model.unit)
+    if summary_section(run, "scatter"):
+        yield _scatter(run)
     if section.get("verdicts"):
         rows_of = tuple((v["term"], v["claim"], v["text"]) for v in section["verdicts"])
         yield TextTable(
@@ -57,10 +58,10 @@ def time_tables(r: ReportInput) -> Iterator[TextTable]:
         )
 
 
-def _gauge(c: CampaignResults) -> TextTable:
-    g = c.section("gauge")
-    name = c.chip_name(g["chip"])
-    scale = display_scale(c.unit, g["sigma_shift"])
+def _gauge(run: ReportedRun) -> TextTable:
+    g = summary_section(run, "gauge")
+    name = chip_name(run, g["chip"])
+    scale = display_scale(run.model.unit, g["sigma_shift"])
     when = "" if g.get("epoch") is None else f" at {g['epoch']:g}"
     shift = ", ".join(
         f"{rounded(s * scale.factor, e * scale.factor)} ± {number(e * scale.factor, 2)}"
@@ -88,10 +89,10 @@ def _line_table(
     names: Mapping[int, str],
     alone: Mapping[tuple[str, int], Mapping[str, Any]],
     published: Published | None,
-    c: CampaignResults,
+    run: ReportedRun,
 ) -> TextTable:
     """Table of alpha and beta of a term: joint fit, single exposures, and published values."""
-    factor, unit = _scale(term, c.unit)
+    factor, unit = _scale(term, run.model.unit)
     rows_of_term = [
         row for row in (*joint, *alone.values()) if row["term"].rpartition(".")[2] == term
     ]
@@ -110,7 +111,7 @@ def _line_table(
         chip = names[row["chip"]]
         head = (chip, f"{row['epoch0']:.1f}")
         rows.append((*head, "joint fit", *_numbers(row, factor, digits)))
-        label = f"{chip}.{term}" if len(c.chips) > 1 else term
+        label = f"{chip}.{term}" if len(run.model.chips) > 1 else term
         if (label, row["segment"]) in alone:
             numbers = _numbers(alone[label, row["segment"]], factor, digits)
             rows.append((*head, "exposures, then line", *numbers))
@@ -120,8 +121,8 @@ def _line_table(
             if published_line.chip == chip and abs(published_line.rdate - row["epoch0"]) < 1e-6
         ]
     system = ""
-    if c.section("gauge"):
-        system = f", in the system of {c.chip_name(c.section('gauge')['chip'])}"
+    if summary_section(run, "gauge"):
+        system = f", in the system of {chip_name(run, summary_section(run, 'gauge')['chip'])}"
     return TextTable(
         f"{name_of_term(term)}: α + β (TIME − RDATE){system}{cited}",
         ("Chip", "RDATE", "From", "α", f"σ α [{unit}]", f"β [{unit}/yr]", f"σ β [{unit}/yr]"),
@@ -132,9 +133,10 @@ def _line_table(
     )
 
 
-def _why_errors_differ(c: CampaignResults) -> str:
+def _why_errors_differ(run: ReportedRun) -> str:
     """Note on why two fits of the same stars have different errors."""
-    n = count(len(c.matching) if c.series is None else len(c.series.exposures))
+    data = campaign_data(run)
+    n = count(len(data.matching) if data.series is None else len(data.series.exposures))
     return (
         "The two σ of this run may differ, here and in the tables below. An exposure that is fitted"
         " alone frees all of its higher-order terms, and the scatter of a term is that of its"
@@ -193,17 +195,17 @@ def _change(term: str, value: float, sigma: float) -> Row:
     return rounded(v, s), number(s, 2), number(value / sigma, 2) if sigma > 0 else MISSING
 
 
-def _scatter(c: CampaignResults) -> TextTable:
+def _scatter(run: ReportedRun) -> TextTable:
     rows: list[Row] = []
-    for kind, tau in c.section("scatter").items():
-        factor, unit = (1e3, f"10⁻³ {c.unit}") if ".shift_" in f".{kind}" else (1e6, "10⁻⁶")
+    for kind, tau in summary_section(run, "scatter").items():
+        factor, unit = (1e3, f"10⁻³ {run.model.unit}") if ".shift_" in f".{kind}" else (1e6, "10⁻⁶")
         low, high = (factor * end for end in tau["interval_68"])
         span = interval(low, high, (high - low) / 2)
         rows.append((name_of_scatter(kind), "joint fit", unit, number(factor * tau["value"]), span))
     n_joint = len(rows)
-    for label, value in c.section("time_dependence").get("scatter", {}).items():
+    for label, value in summary_section(run, "time_dependence").get("scatter", {}).items():
         if value is not None:
-            factor, unit = _scale(label, c.unit)
+            factor, unit = _scale(label, run.model.unit)
             rows.append((label, "exposures alone", unit, number(factor * value), MISSING))
     return TextTable(
         "Scatter of the exposures beyond their formal errors, 1 σ",

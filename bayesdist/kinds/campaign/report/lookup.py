@@ -9,13 +9,19 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import Normalize
 
+from bayesdist.kinds.campaign.report.data import (
+    ChipResiduals,
+    campaign_data,
+    chip_name,
+    summary_section,
+)
 from bayesdist.model import LookupTable
-from bayesdist.report.contents import REPORT, Plot
-from bayesdist.report.context import ChipResiduals, ReportInput, needed
+from bayesdist.report.contents import REPORT, Plot, needed
 from bayesdist.report.figures.arrows import Arrows, magnification_of, spacing, vector_map
 from bayesdist.report.figures.fields import Grid, scalar_map
 from bayesdist.report.figures.panels import ChipPanels
 from bayesdist.report.figures.style import OUTLINE, PALETTE, WIDTH, new_figure, nice_below
+from bayesdist.report.run import ReportedRun, mosaic_of
 from bayesdist.report.sections.run.residuals import residual_panels
 from bayesdist.report.texttable import TextTable, listing, tabulated
 from bayesdist.utils.arrays import Float
@@ -28,11 +34,10 @@ WITHOUT, WITH = PALETTE["vermilion"], PALETTE["blue"]
 _REACH = 4.5  # limit of the axes, in robust standard deviations of the residuals without tables
 
 
-@REPORT.table("campaign-tables", needs=("campaign",))
-def lookup_table(r: ReportInput) -> TextTable:
+@REPORT.table("campaign-tables")
+def lookup_table(run: ReportedRun) -> TextTable:
     """Table that describes the look-up tables of each chip."""
-    c = needed(r.campaign)
-    t = c.section("tables")
+    t = summary_section(run, "tables")
     if not t.get("chips"):
         return listing("Look-up tables", {"Method": "none: no tables were fitted"})
     words = {
@@ -43,7 +48,7 @@ def lookup_table(r: ReportInput) -> TextTable:
     rows = [
         {
             "Of": row.get("filter") or "detector",
-            "Chip": c.chip_name(row["chip"]),
+            "Chip": chip_name(run, row["chip"]),
             "Nodes": "{1} × {0}".format(*row["nodes"]),
             "Rms of an axis [pix]": number(row["rms"]),
             "Largest [pix]": number(row["largest"]),
@@ -63,15 +68,22 @@ def lookup_table(r: ReportInput) -> TextTable:
     return tabulated(caption, rows, words=(0, 1), note=note)
 
 
-@REPORT.figure("campaign-tables", needs=("campaign.residuals", "tables"))
-def table_residuals(r: ReportInput) -> Plot:
+@REPORT.figure(
+    "campaign-tables",
+    needs=(
+        "report_data.residuals",
+        "tables.tables",
+    ),
+)
+def table_residuals(run: ReportedRun) -> Plot:
     """Residuals of single stars on each chip, without the tables and with them.
 
     Figures 6 and 7 of Kozhurina-Platais et al. (2015).
     """
-    results = needed(r.campaign)
-    order = sorted(range(len(results.residuals)), key=lambda k: r.mosaic.places[k])
-    chips = [results.residuals[k] for k in order]  # from top to bottom
+    data = campaign_data(run)
+    places = mosaic_of(run).places
+    order = sorted(range(len(data.residuals)), key=lambda k: places[k])
+    chips = [data.residuals[k] for k in order]  # from top to bottom
     residuals = np.concatenate([c.without for c in chips])
     reach = _REACH * 1.4826 * float(np.median(np.abs(residuals)))
     scale = display_scale("pix", reach)
@@ -100,7 +112,7 @@ def table_residuals(r: ReportInput) -> Plot:
         axes[2].set_xlabel(f"residual [{scale.unit}]")
         axes[2].set_ylabel("stars drawn per bin")
     grid[0, 2].legend(loc="upper left", fontsize=6.5, handlelength=1.5, borderaxespad=0.2)
-    t = results.section("tables")
+    t = summary_section(run, "tables")
     drawn = sum(len(c.without) for c in chips)
     text = (
         "Each point is a star in one exposure, after the best polynomial and a linear map of the"
@@ -116,7 +128,7 @@ def table_residuals(r: ReportInput) -> Plot:
     )
     return Plot(
         fig,
-        f"Residuals {_base(r)} and with all look-up tables",
+        f"Residuals {_base(run)} and with all look-up tables",
         text,
         "Clouds of residuals of each chip, narrower with the tables than before, and histograms.",
     )
@@ -131,45 +143,45 @@ def _cloud(ax: Axes, residual: Float, reach: float, color: str) -> None:
     ax.set_box_aspect(1)
 
 
-def _base(r: ReportInput) -> str:
+def _base(run: ReportedRun) -> str:
     """Clause on the fit with which residuals with tables are compared."""
-    return "with the detector's tables alone" if _has_filter(r) else "without"
+    return "with the detector's tables alone" if _has_filter(run) else "without"
 
 
-def _has_filter(r: ReportInput) -> bool:
+def _has_filter(run: ReportedRun) -> bool:
     """True if the run fitted tables of a filter to those of the detector."""
-    return any(table.filter for table in r.tables)
+    return any(table.filter for table in run.tables.tables)
 
 
 @REPORT.figure(
     "campaign-tables",
-    needs=("campaign.residuals",),
-    each=lambda r: {
+    needs=("report_data.residuals",),
+    each=lambda run: {
         f"residuals_{which}_tables": which
-        for which in ("without", *(("with",) if r.tables else ()))
+        for which in ("without", *(("with",) if run.tables.tables else ()))
     },
 )
-def residual_map(r: ReportInput, which: str) -> Plot:
+def residual_map(run: ReportedRun, which: str) -> Plot:
     """Mean residual of each cell, without the tables or with them, at one scale for both.
 
     Figure 10 of Kozhurina-Platais et al. (2015).
     """
-    c = needed(r.campaign)
-    binned = binned_of(c.residuals, which)
+    data = campaign_data(run)
+    binned = binned_of(data.residuals, which)
     # common scale for both maps, chosen for the vectors without tables
     length = np.concatenate(
-        [_lengths(chip_residuals.binned_without) for chip_residuals in c.residuals]
+        [_lengths(chip_residuals.binned_without) for chip_residuals in data.residuals]
     )
     typical = float(np.quantile(length, 0.95)) if length.size else 1.0
     step = min(
         spacing(chip_residuals.binned_without.x, chip_residuals.binned_without.y)
-        for chip_residuals in c.residuals
+        for chip_residuals in data.residuals
     )
     M = nice_below(1.6 * step / typical) if typical > 0 else 1.0
     key = nice_below(float(length.max(initial=0.0)) / 1.5)
-    panels = residual_panels(binned, r.mosaic, unit="pix", magnification=M, key=key)
+    panels = residual_panels(binned, mosaic_of(run), unit="pix", magnification=M, key=key)
     mean, noise = rms_of_cells(*binned)
-    cell = c.residuals[0].chip.size[0] / len(binned[0].x)
+    cell = data.residuals[0].chip.size[0] / len(binned[0].x)
     largest = largest_cell(*binned)
     text = (
         f"Mean residual of each cell of {cell:.0f} pixels, along the axes of the detector; light"
@@ -179,8 +191,8 @@ def residual_map(r: ReportInput, which: str) -> Plot:
     )
     if which == "without":
         text += " What stands out repeats in all exposures."
-        alone = _has_filter(r)
-        title = f"Residuals over the detector, {_base(r)}{'' if alone else ' tables'}"
+        alone = _has_filter(run)
+        title = f"Residuals over the detector, {_base(run)}{'' if alone else ' tables'}"
     else:
         if mean < noise:
             text += " It is less, because the tables follow these very stars."
@@ -219,31 +231,30 @@ def rms_of_cells(*binned: BinnedResiduals) -> tuple[float, float]:
     return first, second
 
 
-def _figures_by_filter(r: ReportInput, name: str, *, known: bool) -> Mapping[str, str]:
+def _figures_by_filter(run: ReportedRun, name: str, *, known: bool) -> Mapping[str, str]:
     """Names of figures by filter ('' for the detector); with `known`, only with known errors."""
-    tables = [t for t in r.tables if t.sigma is not None or not known]
+    tables = [t for t in run.tables.tables if t.sigma is not None or not known]
     return {f"{name}_{t.filter}" if t.filter else name: t.filter for t in tables}
 
 
-def _by_chip(r: ReportInput, filter: str) -> list[LookupTable | None]:
+def _by_chip(run: ReportedRun, filter: str) -> list[LookupTable | None]:
     """Table of each chip; None for chips without a table."""
-    of = {table.chip: table for table in r.tables if table.filter == filter}
-    return [of.get(c.chip.number) for c in r.chips]
+    of = {table.chip: table for table in run.tables.tables if table.filter == filter}
+    return [of.get(chip.number) for chip in run.model.chips]
 
 
 @REPORT.figure(
     "campaign-tables",
-    needs=("campaign", "tables"),
-    each=lambda r: _figures_by_filter(r, "table_nodes", known=False),
+    needs=("tables.tables",),
+    each=lambda run: _figures_by_filter(run, "table_nodes", known=False),
 )
-def table_nodes(r: ReportInput, filter: str) -> Plot:
+def table_nodes(run: ReportedRun, filter: str) -> Plot:
     """Shifts of the pixels by the tables of a filter, an arrow at each node."""
-    c = needed(r.campaign)
-    chips = _by_chip(r, filter)
-    tables = [t for t in r.tables if t.filter == filter]
+    chips = _by_chip(run, filter)
+    tables = [t for t in run.tables.tables if t.filter == filter]
     length = np.concatenate([np.hypot(*t.values).ravel() for t in tables])
-    panels = ChipPanels(r.mosaic)
-    panels.frame(0.03 * r.mosaic.longest_side)
+    panels = ChipPanels(mosaic_of(run))
+    panels.frame(0.03 * mosaic_of(run).longest_side)
     arrows, titles = [], []
     for k, table in enumerate(chips):
         chip_arrows, text = None, "no table"
@@ -268,7 +279,7 @@ def table_nodes(r: ReportInput, filter: str) -> Plot:
     for t in tables:
         ny, nx = t.shape
         rms = float(np.sqrt((t.values**2).mean()))
-        parts.append(f"{c.chip_name(t.chip)}: {nx} × {ny}, rms of an axis {size_of(rms)}")
+        parts.append(f"{chip_name(run, t.chip)}: {nx} × {ny}, rms of an axis {size_of(rms)}")
     whose = f"filter {filter}, applied second" if filter else "the detector, applied first"
     largest = max(float(np.hypot(*t.values).max()) for t in tables)
     return Plot(
@@ -282,19 +293,18 @@ def table_nodes(r: ReportInput, filter: str) -> Plot:
 
 @REPORT.figure(
     "campaign-tables",
-    needs=("campaign", "tables"),
-    each=lambda r: _figures_by_filter(r, "table_errors", known=True),
+    needs=("tables.tables",),
+    each=lambda run: _figures_by_filter(run, "table_errors", known=True),
 )
-def table_errors(r: ReportInput, filter: str) -> Plot:
+def table_errors(run: ReportedRun, filter: str) -> Plot:
     """Standard errors of the nodes along x and y, in one scale of colours."""
-    c = needed(r.campaign)
-    chips = _by_chip(r, filter)
-    tables = [t for t in r.tables if t.filter == filter]
+    chips = _by_chip(run, filter)
+    tables = [t for t in run.tables.tables if t.filter == filter]
     errors = np.concatenate([t.sigma.ravel() for t in tables if t.sigma is not None])
     # a few nodes without stars must not dominate the colour scale
     low, high = float(errors.min()), float(np.quantile(errors, 0.995))
     scale = display_scale("pix", high)
-    panels = ChipPanels(r.mosaic, 2, colorbar=True)
+    panels = ChipPanels(mosaic_of(run), 2, colorbar=True)
     panels.frame()
     grids: list[Grid | None] = []
     titles = []
@@ -314,7 +324,7 @@ def table_errors(r: ReportInput, filter: str) -> Plot:
         label=f"σ of a node [{scale.unit}]",
         norm=Normalize(low * scale.factor, high * scale.factor),
     )
-    rows = c.section("tables").get("chips", ())
+    rows = summary_section(run, "tables").get("chips", ())
     row_by_chip_and_filter = {(row["chip"], row.get("filter") or ""): row for row in rows}
     parts, worst = [], 0.0
     for t in tables:
@@ -322,7 +332,7 @@ def table_errors(r: ReportInput, filter: str) -> Plot:
             continue
         row = row_by_chip_and_filter.get((t.chip, filter), {})
         median = row.get("sigma_median") or float(np.median(t.sigma))
-        parts.append(f"{c.chip_name(t.chip)} {size_of(median)}")
+        parts.append(f"{chip_name(run, t.chip)} {size_of(median)}")
         worst = max(worst, float(t.sigma.max()))
     return Plot(
         panels.figure,

@@ -8,27 +8,26 @@ import numpy as np
 
 from bayesdist.diagnose.overlap import OverlapTest
 from bayesdist.plugin import mission_objects
-from bayesdist.report.contents import REPORT, Plot
-from bayesdist.report.context import ReportInput, needed
+from bayesdist.report.contents import REPORT, Plot, needed
 from bayesdist.report.figures.arrows import Arrows, magnification_of, vector_map
 from bayesdist.report.figures.panels import Panels
 from bayesdist.report.figures.style import WIDTH, new_figure, nice_below
+from bayesdist.report.run import ReportedRun
 from bayesdist.report.texttable import TextTable, tabulated
 from bayesdist.utils.numbers import count, number, size_of
 
 MIN_STARS_PER_CELL = 5  # of a cell that is drawn and counted
 
 
-@REPORT.table("campaign-release", needs=("campaign",))
-def released_files(r: ReportInput) -> TextTable | None:
+@REPORT.table("campaign-release")
+def released_files(run: ReportedRun) -> TextTable | None:
     """Table of files for pipelines with their dates; None if no files were written."""
-    c = needed(r.campaign)
     releases = mission_objects(lambda mission: mission.releases).values()
     kinds = {kind: text for release in releases for kind, text in release.kinds.items()}
-    files = [p for p in c.summary.get("products") or () if p["kind"] in kinds]
+    files = [p for p in run.summary.get("products") or () if p["kind"] in kinds]
     if not files:
         return None
-    release = r.config.get("products", {}).get("release") or {}
+    release = run.configuration.get("products", {}).get("release") or {}
     years = {p["name"]: p["years"] for p in release.get("period", ())}
     rows = []
     for p in files:
@@ -46,13 +45,13 @@ def released_files(r: ReportInput) -> TextTable | None:
     return tabulated("Released files", rows, words=(0, 1, 2))
 
 
-@REPORT.figure("campaign-release", needs=("campaign.overlap",))
-def overlap(r: ReportInput) -> Plot:
+@REPORT.figure("campaign-release", needs=("diagnostics.overlap",))
+def overlap(run: ReportedRun) -> Plot:
     """Residuals between two exposures after shift, rotation and scale: old files and new.
 
     Figures 27 and 28 of Kozhurina-Platais et al. (2015).
     """
-    t = needed(needed(r.campaign).overlap)
+    t = needed(run.diagnostics.overlap)
     states = {"old": (t.binned_old, t.old), "new": (t.binned_new, t.new)}
     panels, arrows, titles, largest = _panels(t), [], [], {}
     for state, (binned, test_result) in states.items():

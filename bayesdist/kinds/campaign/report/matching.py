@@ -7,8 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.ticker import ScalarFormatter
 
-from bayesdist.report.contents import REPORT, Plot
-from bayesdist.report.context import CatalogStars, ReportInput, needed
+from bayesdist.kinds.campaign.report.data import CatalogStars, campaign_data, summary_section
+from bayesdist.report.contents import REPORT, Plot, needed
 from bayesdist.report.figures.style import (
     GUIDE,
     INK,
@@ -18,6 +18,7 @@ from bayesdist.report.figures.style import (
     guide_lines,
     new_figure,
 )
+from bayesdist.report.run import ReportedRun
 from bayesdist.report.texttable import TextTable, listing
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.numbers import count, number, percent, size_of
@@ -26,39 +27,40 @@ _DOT = "#8FA3B5"
 _LEFT_OUT = PALETTE["vermilion"]
 
 
-@REPORT.table("campaign-matching", needs=("campaign",))
-def matching_table(r: ReportInput) -> TextTable:
+@REPORT.table("campaign-matching")
+def matching_table(run: ReportedRun) -> TextTable:
     """Table of matched detections, and of those that were left out."""
-    c = needed(r.campaign)
-    m = c.section("matching")
+    data = campaign_data(run)
+    m = summary_section(run, "matching")
     left_out = {
-        name: int(c.matching[name].sum())
+        name: int(data.matching[name].sum())
         for name in ("too bright", "too faint", "saturated", "poor fit")
-        if name in c.matching.colnames
+        if name in data.matching.colnames
     }
     low, high = m["radius"]
     pairs = {
         "Catalogue": f"{count(m['n_catalog'])} stars, {count(m['n_catalog_used'])} used",
-        "Exposures": f"{count(m['n_exposures'])} in {c.filter}",
+        "Exposures": f"{count(m['n_exposures'])} in {data.filter}",
         "Detections": count(m["n_detections"]),
         **{f"Left out: {name}": count(n) for name, n in left_out.items()},
         "Pairs": count(m["n_pairs"]),
         "Completeness": f"{percent(m['completeness']['median'])} at the median,"
         f" {percent(m['completeness']['least'])} at least",
         "False pairs expected": percent(m["false_fraction"], 2),
-        "Search radius": f"{number(low)} to {number(high)} {c.unit}",
+        "Search radius": f"{number(low)} to {number(high)} {run.model.unit}",
     }
     return listing("Matching", pairs)
 
 
-@REPORT.figure("campaign-matching", needs=("campaign.catalog",))
-def catalogue_errors(r: ReportInput) -> Plot:
+@REPORT.figure("campaign-matching", needs=("report_data.catalog",))
+def catalogue_errors(run: ReportedRun) -> Plot:
     """Errors of positions, and of proper motions with the limit of their selection.
 
     Figure 3 of Kozhurina-Platais et al. (2015).
     """
-    c = needed(r.campaign)
-    catalog, centroids, section = needed(c.catalog), c.centroids, c.section("matching")
+    data = campaign_data(run)
+    catalog, centroids = needed(data.catalog), run.errors.by_magnitude
+    section = summary_section(run, "matching")
     fig = new_figure(WIDTH, 3.3)
     position_axes, right = fig.subplots(1, 2)
     if catalog.sigma is not None:
@@ -98,7 +100,7 @@ def catalogue_errors(r: ReportInput) -> Plot:
         text += (
             " Blue: scatter of the residuals by magnitude; line: error of a single detection, which"
             " is that scatter with the catalogue's part taken out; at best"
-            f" {size_of(best, c.unit)}."
+            f" {size_of(best, run.model.unit)}."
         )
     if catalog.limit is not None:
         text += (
@@ -138,10 +140,10 @@ def _motions(ax: Axes, catalog: CatalogStars, error: Float) -> None:
     ax.set_title("Proper motions, larger axis")
 
 
-@REPORT.figure("campaign-matching", needs=("campaign.detections",))
-def fit_quality(r: ReportInput) -> Plot:
+@REPORT.figure("campaign-matching", needs=("report_data.detections",))
+def fit_quality(run: ReportedRun) -> Plot:
     """Quality of the PSF fit against magnitude, with the cuts."""
-    d = needed(needed(r.campaign).detections)
+    d = needed(campaign_data(run).detections)
     faintest, brightest = np.quantile(d.mag, (0.9995, 0.001))
     low, high = np.quantile(d.q[d.q > 0], (0.0005, 0.9995))
     fig = new_figure(WIDTH, 3.5)
@@ -182,15 +184,19 @@ def fit_quality(r: ReportInput) -> Plot:
     )
 
 
-@REPORT.figure("campaign-matching", needs=("campaign",))
-def matching(r: ReportInput) -> Plot:
+@REPORT.figure("campaign-matching")
+def matching(run: ReportedRun) -> Plot:
     """Completeness and fraction of false pairs of each exposure, against its date."""
-    c = needed(r.campaign)
-    epoch = np.asarray(c.matching["epoch"], float)
+    data = campaign_data(run)
+    epoch = np.asarray(data.matching["epoch"], float)
     rows = (
-        ("completeness [%]", 100 * np.asarray(c.matching["completeness"], float), "blue"),
-        ("false pairs [10⁻⁶]", 1e6 * np.asarray(c.matching["false_fraction"], float), "vermilion"),
-        ("pairs", np.asarray(c.matching["matched"], float), "green"),
+        ("completeness [%]", 100 * np.asarray(data.matching["completeness"], float), "blue"),
+        (
+            "false pairs [10⁻⁶]",
+            1e6 * np.asarray(data.matching["false_fraction"], float),
+            "vermilion",
+        ),
+        ("pairs", np.asarray(data.matching["matched"], float), "green"),
     )
     fig = new_figure(WIDTH, 4.2)
     axes = fig.subplots(len(rows), 1, sharex=True)
@@ -203,7 +209,7 @@ def matching(r: ReportInput) -> Plot:
     axes[2].set_ylim(bottom=0)
     axes[2].set_xlabel("epoch [yr]")
     fig.align_ylabels(axes)
-    m = c.section("matching")
+    m = summary_section(run, "matching")
     completeness = m["completeness"]
     return Plot(
         fig,
@@ -213,16 +219,16 @@ def matching(r: ReportInput) -> Plot:
         f" {percent(completeness['least'])} at least. Middle: fraction of pairs that is expected"
         f" to be false, {number(m['false_fraction'], 2)} over all. Bottom: pairs,"
         f" {count(m['n_pairs'])} in {count(m['n_exposures'])} exposures. Search radii were"
-        f" {number(m['radius'][0])} to {size_of(m['radius'][1], c.unit)}.",
+        f" {number(m['radius'][0])} to {size_of(m['radius'][1], run.model.unit)}.",
         "Completeness, fraction of false pairs and number of pairs of each exposure against date.",
     )
 
 
-@REPORT.figure("campaign-matching", needs=("campaign.footprints",))
-def footprints(r: ReportInput) -> Plot:
+@REPORT.figure("campaign-matching", needs=("report_data.footprints",))
+def footprints(run: ReportedRun) -> Plot:
     """Outlines of the chips of every exposure over the catalogue."""
-    c = needed(r.campaign)
-    field = needed(c.footprints)
+    data = campaign_data(run)
+    field = needed(data.footprints)
     fig = new_figure(0.85 * WIDTH, 0.78 * WIDTH, layout="compressed")
     ax = fig.subplots()
     ax.plot(field.u, field.v, ".", ms=1.3, color="#9AA7B4", mec="none", zorder=1)
@@ -245,8 +251,8 @@ def footprints(r: ReportInput) -> Plot:
     bar = fig.colorbar(lines, ax=ax, fraction=0.045, pad=0.02, label="epoch [yr]")
     bar.ax.yaxis.set_major_formatter(ScalarFormatter(useOffset=False))
     ax.tick_params(colors=INK)
-    n = len(field.outlines) // len(c.chips)
-    rolls: Float = np.ma.filled(np.ma.asarray(c.matching["pa_v3"], float), np.nan)
+    n = len(field.outlines) // len(run.model.chips)
+    rolls: Float = np.ma.filled(np.ma.asarray(data.matching["pa_v3"], float), np.nan)
     text = (
         f"Outlines of the chips of {count(n)} exposures over the catalogue, coloured by date; the"
         " first, the middle and the last one are drawn strong."

@@ -1,0 +1,55 @@
+"""Figures and tables of campaigns; importing this package adds them to the report."""
+
+from typing import Any
+
+from bayesdist.kinds.campaign.report import lines, lookup, matching, release, series  # noqa: F401
+from bayesdist.kinds.campaign.report.data import CampaignData
+from bayesdist.report.contents import REPORT, Section
+
+__all__: list[str] = []
+
+
+def _is_campaign(run: Any) -> bool:
+    """True for the run of a campaign."""
+    return isinstance(run.report_data, CampaignData)
+
+
+REPORT.insert(
+    "data",
+    Section(
+        "campaign",
+        "Campaign",
+        when=_is_campaign,
+        explained=("campaign", ""),
+        groups=("Campaign",),
+    ),
+    Section(
+        "campaign-matching",
+        "Catalogue and matching",
+        parent="campaign",
+        when=_is_campaign,
+        explained=("campaign", "The catalogue"),
+    ),
+    Section(
+        "campaign-tables",
+        "Look-up tables",
+        parent="campaign",
+        when=_is_campaign,
+        explained=("campaign", ""),
+    ),
+    Section(
+        "campaign-time",
+        "Linear terms against time",
+        parent="campaign",
+        when=_is_campaign,
+        explained=("campaign", ""),
+    ),
+    Section(
+        "campaign-release",
+        "Released files and the alignment of two exposures",
+        parent="campaign",
+        printed=False,  # these products are in files
+        when=_is_campaign,
+        explained=("campaign", ""),
+    ),
+)

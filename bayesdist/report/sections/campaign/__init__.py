@@ -1,1 +1,0 @@
-"""Sections of runs on star lists."""
