@@ -7,7 +7,7 @@ PLUGIN = Plugin(
         "campaign": "bayesdist.kinds.campaign.config:CampaignConfig",
         "selfcal": "bayesdist.kinds.selfcal.config:SelfcalConfig",
     },
-    reports=("bayesdist.kinds.selfcal.report", "bayesdist.kinds.campaign.report"),
+    reports=("bayesdist.kinds.campaign.report", "bayesdist.kinds.selfcal.report"),
     commands={
         "plan-dither": "bayesdist.kinds.selfcal.commands:plan_dither",
         "release": "bayesdist.kinds.campaign.commands:release",

@@ -95,6 +95,7 @@ class Registry:
     def __init__(self, name: str, sections: Sequence[Section]) -> None:
         self.name, self.sections = name, tuple(sections)
         self._entries: list[Entry] = []
+        self._inserted: set[str] = set()  # names of sections that plugins have added
 
     def figure(
         self,
@@ -135,9 +136,16 @@ class Registry:
         return register
 
     def insert(self, after: str, *sections: Section) -> None:
-        """Add sections after the one with the given name."""
-        place = [section.name for section in self.sections].index(after) + 1
+        """Add sections after the one with the given name.
+
+        Those of several plugins follow each other by name, whichever is imported first.
+        """
+        names = [section.name for section in self.sections]
+        place = names.index(after) + 1
+        while names[place] in self._inserted and names[place] < sections[0].name:
+            place += 1
         self.sections = (*self.sections[:place], *sections, *self.sections[place:])
+        self._inserted |= {section.name for section in sections}
 
     @property
     def entries(self) -> tuple[Entry, ...]:

@@ -54,7 +54,7 @@ from bayesdist.app.artefacts.stored_fit import read_stored_fit
 from bayesdist.assess.terms.parameters import ScaleError
 from bayesdist.data import Matches
 from bayesdist.infer import GaussianPriors, build_model, fit_linear
-from bayesdist.report.context import Terminology
+from bayesdist.report.words import Terminology
 from bayesdist.utils.checks import Check
 
 
@@ -69,7 +69,7 @@ class Mask(Part):
 
 
 class SpotsKind(RunKind):
-    rows = "spots"
+    words = Terminology(rows="spots", all_rows="spots", false_rows="false spots")
 
     def read(self, config, base):
         x, y, u, v = np.loadtxt(base / config.spots.file).T
@@ -111,10 +111,6 @@ class SpotsKind(RunKind):
 
     def checks(self, run):
         return (Check("Mask", "Scale of the mask", str(run.part(Mask).scale_sigma)),)
-
-    def report_parts(self, run):
-        return {"words": Terminology(rows="spots", all_rows="spots", false_rows="false spots")}
-
 
 SPOTS = SpotsKind()
 '''

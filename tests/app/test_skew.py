@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from lxml import html as lxml_html
@@ -24,7 +22,7 @@ from tests.app.support import (
     write_job,
 )
 from tests.reduced import only_in_full
-from tests.report.runs import report_input
+from tests.report.runs import report_run
 
 FILES = ("coefficients.ecsv", "budget.ecsv", "margins.ecsv", "sip.hdr")
 
@@ -102,10 +100,10 @@ def test_the_report_has_that_of_fit_and_posterior(pair, finished):
 
 
 def test_extra_weight_in_the_corners_is_flagged():
-    inputs = report_input()
+    run = report_run()
     for weight in (1.0, 10.0):
-        config = {**inputs.config, "fit": {"skew": True, "radial_weight": weight}}
-        tables = fit_tables(replace(inputs, config=config))
+        config = {**run.configuration, "fit": {"skew": True, "radial_weight": weight}}
+        tables = fit_tables(run.having(configuration=config))
         [table] = [table for table in tables if "Skew of the axes" in table.caption]
         assert ("With 10 times the weight in the corners" in table.note) == (weight > 1)
 

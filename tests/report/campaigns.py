@@ -8,22 +8,22 @@ from functools import lru_cache
 import numpy as np
 from astropy.table import Table
 
+from bayesdist.app.artefacts.parts import StoredLookupTables
 from bayesdist.data import MagnitudeErrors
 from bayesdist.diagnose.overlap import OverlapTest, _binned, align
 from bayesdist.diagnose.residuals.binned import binned_residuals
-from bayesdist.model import LookupTable
-from bayesdist.report.context import (
-    PAIRED,
-    CampaignResults,
+from bayesdist.kinds.campaign.kind import CAMPAIGN
+from bayesdist.kinds.campaign.report.data import (
+    CampaignData,
     CatalogStars,
     ChipResiduals,
     Detections,
     Footprints,
     LinearSeries,
-    ReportInput,
 )
+from bayesdist.model import LookupTable
 
-from .runs import report_input
+from .runs import SketchedRun, report_run
 
 SIZE = (512.0, 256.0)
 NAMES = ("WFC1", "WFC2")
@@ -184,7 +184,7 @@ def overlap(seed: int = 5) -> OverlapTest:
     )  # fmt: skip
 
 
-def results(chips, **changes) -> CampaignResults:
+def data_of(chips) -> CampaignData:
     rng = np.random.default_rng(6)
     mag = np.sort(rng.uniform(-15, -7, 3000))
     sigma = 0.008 * 10 ** (0.15 * np.maximum(mag + 10, 0))
@@ -203,15 +203,10 @@ def results(chips, **changes) -> CampaignResults:
     )
     square = np.array([[0, 0], [400, 0], [400, 300], [0, 300], [0, 0]], float)
     grid = np.linspace(-14, -10, 9)
-    width = 0.01 * 10 ** (0.1 * (grid + 14))
-    base = CampaignResults(
-        summary=summary(),
+    return CampaignData(
         filter="F606W",
         matching=matching,
-        chips=tuple(chips),
-        unit="pix",
         catalog=CatalogStars(mag, sigma, sigma / 10, (grid, 0.003 + 0 * grid), "pix", 4_964),
-        centroids=MagnitudeErrors(grid, width, width, np.full(9, 100), width, width),
         detections=Detections(mag, 10 * sigma, mag < -10, 98_765, 51_234, (-14.0, -10.0), 0.1),
         footprints=Footprints(
             rng.uniform(0, 900, 500),
@@ -222,21 +217,28 @@ def results(chips, **changes) -> CampaignResults:
         ),
         residuals=tuple(residuals_of(chip) for chip in chips),
         series=series,
-        overlap=overlap(),
     )
-    return replace(base, **changes)
+
+
+def centroids() -> MagnitudeErrors:
+    """Errors of single detections."""
+    grid = np.linspace(-14, -10, 9)
+    width = 0.01 * 10 ** (0.1 * (grid + 14))
+    return MagnitudeErrors(grid, width, width, np.full(9, 100), width, width)
 
 
 @lru_cache
-def campaign_input() -> ReportInput:
-    """A run of two chips with what a campaign adds."""
-    run = report_input(size=SIZE, names=NAMES)
-    chips = [c.chip for c in run.chips]
+def campaign_run() -> SketchedRun:
+    """A campaign of two chips."""
+    run = report_run(size=SIZE, names=NAMES)
+    chips = run.model.chips
     release = {"period": [{"name": "pre", "years": [2002, 2009.4]}]}
-    return replace(
-        run,
-        config={**run.config, "products": {"release": release}},
-        campaign=results(chips),
-        tables=tuple(pattern(chip.number) for chip in chips),
-        words=PAIRED,
+    return run.having(
+        configuration={**run.configuration, "products": {"release": release}},
+        kind=CAMPAIGN,
+        errors=replace(run.errors, by_magnitude=centroids()),
+        summary=summary(),
+        report_data=data_of(chips),
+        overlap=overlap(),
+        tables=StoredLookupTables(tuple(pattern(chip.number) for chip in chips)),
     )

@@ -6,22 +6,21 @@ import shutil
 
 import pytest
 
-from bayesdist.report.context import ReportInput
 from bayesdist.report.run_report import render_report
 
-from .campaigns import campaign_input
+from .campaigns import campaign_run
 from .plots import drawings_of, plots_of
-from .runs import report_input
+from .runs import SketchedRun, report_run
 
 
 @pytest.fixture(scope="session")
-def converged() -> ReportInput:
-    return report_input()
+def converged() -> SketchedRun:
+    return report_run()
 
 
 @pytest.fixture(scope="session")
-def not_converged() -> ReportInput:
-    return report_input(converged=False)
+def not_converged() -> SketchedRun:
+    return report_run(converged=False)
 
 
 @pytest.fixture(scope="session")
@@ -42,7 +41,7 @@ def drawings(plots):
 
 @pytest.fixture(scope="session")
 def campaign_plots():
-    return plots_of(campaign_input())
+    return plots_of(campaign_run())
 
 
 @pytest.fixture(scope="session")

@@ -9,31 +9,31 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from bayesdist.report.contents import Plot
-from bayesdist.report.context import ReportInput
 from bayesdist.report.drawing import Drawing
+from bayesdist.report.run import ReportedRun
 from bayesdist.report.sections import REPORT
 
 
-def plots_of(r: ReportInput, *names: str) -> dict[str, Plot]:
+def plots_of(run: ReportedRun, *names: str) -> dict[str, Plot]:
     """Figures with their words, of these names or all."""
-    items = REPORT.items(r, "figure")
-    return {item.name: item.made(r) for item in items if not names or item.name in names}
+    items = REPORT.items(run, "figure")
+    return {item.name: item.made(run) for item in items if not names or item.name in names}
 
 
-def figures_of(r: ReportInput, *names: str) -> dict[str, Figure]:
-    return {name: plot.figure for name, plot in plots_of(r, *names).items()}
+def figures_of(run: ReportedRun, *names: str) -> dict[str, Figure]:
+    return {name: plot.figure for name, plot in plots_of(run, *names).items()}
 
 
-def plot_of(r: ReportInput, name: str) -> Plot:
-    return plots_of(r, name)[name]
+def plot_of(run: ReportedRun, name: str) -> Plot:
+    return plots_of(run, name)[name]
 
 
-def tables_of(r: ReportInput, section: str) -> list:
+def tables_of(run: ReportedRun, section: str) -> list:
     """Tables of a section."""
     out = []
-    for item in REPORT.items(r, "table"):
+    for item in REPORT.items(run, "table"):
         if item.section == section:
-            made = item.made(r)
+            made = item.made(run)
             out += [made] if hasattr(made, "rows") else list(made or ())
     return out
 

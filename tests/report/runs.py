@@ -8,22 +8,31 @@ Coefficients: band W2 of Appendix B of the WISE distortion report (u, v in pixel
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
-from astropy.table import Table
 
+from bayesdist.app.artefacts.parts import NO_TABLES, StoredLookupTables
+from bayesdist.app.artefacts.stars import QUOTED, ErrorLaw
+from bayesdist.app.kinds.kind import RunKind
+from bayesdist.app.kinds.matches.kind import MATCHES
 from bayesdist.assess import (
     Requirement,
     UserTerm,
     area_map,
-    distortion_vectors,
     uncertainty_map,
 )
-from bayesdist.assess.solution import chip_places
+from bayesdist.assess.comparison.compare import Comparison
+from bayesdist.assess.evaluation import Evaluation, EvaluationSettings
 from bayesdist.data.magnitude_errors import estimate
 from bayesdist.data.matches import Matches
+from bayesdist.diagnose.diagnostics import SHOWN, Diagnostics
 from bayesdist.diagnose.residuals.stars import flagged_by_exposure, star_sample, star_sums
+from bayesdist.infer.catalogue.added_errors import GroupedErrors
 from bayesdist.infer.convergence import Convergence, Limits
 from bayesdist.infer.posterior import Posterior, SamplerInfo
 from bayesdist.infer.posterior.checks import ChiSquare, fit_checks, sampling_checks
@@ -31,8 +40,6 @@ from bayesdist.infer.solution.linear import LinearFit, fit_linear, residuals
 from bayesdist.infer.stars.likelihood import OutlierMixture
 from bayesdist.infer.stars.loading import load
 from bayesdist.model import Chip, DistortionModel, TimeDependence
-from bayesdist.report.context import ChipResults, Product, ReportInput
-from bayesdist.utils.checks import Check
 from tests.assess.by_draws import margins_by_draws
 from tests.budgets import detector_budget
 
@@ -50,6 +57,7 @@ W2_B = {
     (1, 3): 8.534495e-13, (2, 0): 8.038015e-08, (2, 1): 4.101600e-10, (2, 2): -5.705721e-13,
     (3, 0): 1.067827e-10, (3, 1): 1.952342e-12, (4, 0): -1.788157e-13,
 }  # fmt: skip
+CELLS = (16, 16)  # of the map of mean residuals
 F, JITTER, S_OUT = 0.03, 0.02, 0.6
 
 
@@ -180,111 +188,112 @@ TERMS = (
 )
 
 
-def coefficient_table(fit: LinearFit, posterior: Posterior | None) -> Table:
-    t = Table()
-    p = fit.model.parameters
-    t["name"] = [q.name for q in p]
-    t["chip"], t["i"], t["j"] = ([getattr(q, k) for q in p] for k in ("chip", "i", "j"))
-    t["axis"] = [q.axis for q in p]
-    t["lsq_value"], t["lsq_sigma"] = fit.mean, fit.sigma
-    if posterior is not None:
-        sd = np.sqrt(np.diag(posterior.cov))
-        t["mean"], t["sd"] = posterior.mean, sd
-        for name, z in (("lo68", -1), ("hi68", 1), ("lo95", -1.96), ("hi95", 1.96)):
-            t[name] = posterior.mean + z * sd
-        t["rhat"] = posterior.convergence.rhat[: len(p)]
-        t["ess_bulk"] = posterior.convergence.ess_bulk[: len(p)]
-    t["unit"] = [q.unit for q in p]
-    return t
+@dataclass(frozen=True, eq=False)
+class SketchedRun:
+    """A `ReportedRun` whose members are given."""
 
+    title: str
+    configuration: Mapping[str, Any]
+    fit: LinearFit
+    posterior: Posterior
+    diagnostics: Diagnostics
+    evaluation: Evaluation
+    errors: ErrorLaw = QUOTED
+    added_errors: GroupedErrors | None = None
+    held_parameters: frozenset[str] = frozenset()
+    tables: StoredLookupTables = NO_TABLES
+    kind: RunKind = MATCHES
+    previous: tuple[Comparison, ...] = ()
+    report_data: Any = None
+    summary: Mapping[str, Any] = field(default_factory=dict)
+    provenance: Mapping[str, Any] = field(default_factory=dict)
 
-def _chip_results(fit, posterior, chip, where, sums, place) -> ChipResults:
-    solution, place = posterior or fit, place | {"chip": chip.number}
-    return ChipResults(
-        chip=chip,
-        formal_map=uncertainty_map(fit, **place),
-        posterior_map=None if posterior is None else uncertainty_map(posterior, **place),
-        displacement=distortion_vectors(solution, part="no_constant", **place),
-        non_linear=distortion_vectors(solution, part="non_linear", **place),
-        area=area_map(solution, **place),
-        binned=sums.binned[chip.number, (16, 16)].residuals(),
-        place=where,
-    )
+    @property
+    def model(self) -> DistortionModel:
+        return self.fit.model
+
+    @property
+    def solution(self) -> Posterior:
+        return self.posterior
+
+    def having(self, **changes: Any) -> SketchedRun:
+        """The run with other members, or other members of its diagnostics and evaluation."""
+        own = {field.name for field in dataclasses.fields(self)}
+        for name in ("diagnostics", "evaluation"):
+            part = getattr(self, name)
+            of_part = {field.name for field in dataclasses.fields(part)} & changes.keys() - own
+            new = {key: changes.pop(key) for key in of_part}
+            changes[name] = replace(changes.get(name, part), **new)
+        return replace(self, **changes)
 
 
 @lru_cache
-def report_input(
+def report_run(
     *,
     converged: bool = True,
-    sampler: bool = True,
     outliers: str = "gaussian",
     unit: str = "pix",
     size: tuple[float, float] = SIZE,
     scale: float = 1.0,
     shown: int = 1_000_000,
     names: tuple[str, ...] = ("W2",),
-) -> ReportInput:
-    """Everything of a run, as the report takes it; at most `shown` stars are drawn."""
+) -> SketchedRun:
+    """A run as the report takes it; at most `shown` stars are drawn."""
     rng = np.random.default_rng(11)
     table = simulated(unit=unit, size=size, scale=scale, names=names)
     fit = fit_linear(table, wise_model(unit, size, names))
-    posterior = None
-    if sampler:
-        posterior = sampled(fit, table, converged=converged, outliers=outliers, scale=scale)
-    solution = posterior or fit
+    posterior = sampled(fit, table, converged=converged, outliers=outliers, scale=scale)
     shards = load(fit.model, table)
-    bins = {chip.number: ((16, 16),) for chip in fit.model.chips}
-    sums = shards.sum(star_sums, fit.likelihood, solution.likelihood, bins)
+    numbers = [chip.number for chip in fit.model.chips]
+    bins = dict.fromkeys(numbers, (CELLS,))
+    sums = shards.sum(star_sums, fit.likelihood, posterior.likelihood, bins)
     stars = star_sample(table.sample(shown), len(table), fit, posterior)
     mag, residual = (a[stars.used] for a in (stars.table.mag, stars.fit_residual))
     place = {"epoch": 2010.3}
-    return ReportInput(
-        name="wise-w2",
-        config={
+    chi_square = ChiSquare(fit.chi2, fit.dof)
+    diagnostics = Diagnostics(
+        sums=sums,
+        partitions={number: {SHOWN: CELLS} for number in numbers},
+        misfits=(),
+        coverage=(),
+        sample=stars,
+        chi_square=chi_square,
+        input_checks=(),
+        dates=np.unique(table.epoch),
+        flagged=flagged_by_exposure(shards, posterior),
+    )
+    assessed = {"terms": TERMS, "n_draws": 500, "rng": rng, "pixel_scale": 2757.0} | place
+    evaluation = Evaluation(
+        settings=EvaluationSettings(scale_mas=2757.0, **place),
+        formal=tuple(uncertainty_map(fit, chip=n, **place) for n in numbers),
+        maps=tuple(uncertainty_map(posterior, chip=n, **place) for n in numbers),
+        relative=(),
+        areas=tuple(area_map(posterior, chip=n, **place) for n in numbers),
+        budget=detector_budget(posterior, **assessed),
+        surface=None,
+        margins=margins_by_draws(posterior, REQUIREMENTS, **assessed),
+        validity=(),
+        checks=(*sampling_checks(posterior), chi_square.check(), *fit_checks(fit)),
+    )
+    return SketchedRun(
+        title="wise-w2",
+        configuration={
             "data": {"matches": "wise-w2.ecsv", "unit": unit, "sigma": "by_magnitude"},
             "detector": {"name": "W2", "size": list(size), "scale_mas": 2757.0},
             "model": {"order": 4, "frames": "shift"},
             "fit": {"clip_chi2": 25.0, "clip_abs": 2.0},
         },
-        stars=stars,
-        exposures=sums.exposures,
         fit=fit,
         posterior=posterior,
-        chips=tuple(
-            _chip_results(fit, posterior, chip, where, sums, place)
-            for chip, where in zip(fit.model.chips, chip_places(solution, **place), strict=True)
-        ),
-        coefficients=coefficient_table(fit, posterior),
-        budget=detector_budget(
-            solution, terms=TERMS, n_draws=500, rng=rng, pixel_scale=2757.0, **place
-        ),
-        margins=margins_by_draws(
-            solution, REQUIREMENTS, terms=TERMS, n_draws=500, rng=rng, pixel_scale=2757.0, **place
-        ),
-        products=(
-            Product(
-                "sip.hdr",
-                "SIP header, order 4, with inverse of order 5",
-                (
-                    Check(
-                        "Products",
-                        "worst closure of the inverse [pix]",
-                        3.1e-6,
-                        "at most 0.001",
-                        "pass",
-                    ),
-                    Check("Products", "A_DMAX [pix]", 2.21),
-                ),
-            ),
-            Product("maps.fits", "uncertainty maps"),
-        ),
-        checks=(
-            *sampling_checks(posterior),
-            ChiSquare(fit.chi2, fit.dof).check(),
-            *fit_checks(fit),
-        ),
-        magnitude_errors=estimate(mag, *residual.T),
-        flagged=None if posterior is None else flagged_by_exposure(shards, posterior),
+        diagnostics=diagnostics,
+        evaluation=evaluation,
+        errors=ErrorLaw(by_magnitude=estimate(mag, *residual.T)),
+        summary={
+            "products": [
+                written("sip.hdr", "SIP header", closure_pix=3.1e-6, a_dmax=2.21),
+                written("maps.fits", "uncertainty maps"),
+            ]
+        },
         provenance={
             "command": "bayesdist run wise.toml -o run",
             "seed": 1,
@@ -293,3 +302,8 @@ def report_input(
             "timings": {"fit": 0.4, "sample": 21.4, "assess": 3.2},
         },
     )
+
+
+def written(path: str, kind: str, *findings: str, **numbers: Any) -> dict[str, Any]:
+    """A product as in summary.json."""
+    return {"path": path, "kind": kind, "findings": list(findings), **numbers}

@@ -6,7 +6,6 @@ Truth is `place_budget` and the rows of `budget.ecsv`, which know nothing of the
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -26,7 +25,7 @@ from bayesdist.report.run_report import write_report
 from tests.budgets import Curvature, detector_budget
 
 from .plots import drawings_of, plots_of
-from .runs import TERMS, report_input
+from .runs import TERMS, report_run
 
 GRID, DRAWS, SCALE = (9, 7), 400, 2757.0
 YEARS = (2009.5, 2020.5)
@@ -35,9 +34,9 @@ YEARS = (2009.5, 2020.5)
 @pytest.fixture(scope="module")
 def asked():
     """A run of two chips that drifts, the draws behind its budget, and that budget."""
-    run = report_input(size=(4096.0, 2048.0), names=("WFC2", "WFC1"))
+    run = report_run(size=(4096.0, 2048.0), names=("WFC2", "WFC1"))
     solution, rng = run.solution, np.random.default_rng(4)
-    local = {c.chip.number: rng.uniform(0.001, 0.01, (*GRID[::-1], 2)) for c in run.chips}
+    local = {c.number: rng.uniform(0.001, 0.01, (*GRID[::-1], 2)) for c in run.model.chips}
     terms = (
         ScaleError("aberration", "scale", 2e-6, solution, "a paper"),
         Curvature(solution, 1e-4),
@@ -46,7 +45,10 @@ def asked():
         UserTerm("background", "random", 0.003, 0.006),
         file_term("sip.hdr, forward", "its numbers"),
     )
-    mag, residual = (a[run.stars.used] for a in (run.stars.table.mag, run.stars.fit_residual))
+    mag, residual = (
+        a[run.diagnostics.sample.used]
+        for a in (run.diagnostics.sample.table.mag, run.diagnostics.sample.fit_residual)
+    )
     centroids = Centroids(estimate(mag, *residual.T))
     model = error_model(solution, terms=(*terms, centroids), pixel_scale=SCALE)
     errors = model.drawn(DRAWS, np.random.default_rng(9))
@@ -60,7 +62,7 @@ def asked():
         pixel_scale=SCALE,
     )
     surface = budget_surface(errors, GRID, epoch=2010.3, years=YEARS)
-    run = replace(run, budget=budget, surface=surface)
+    run = run.having(budget=budget, surface=surface)
     return SimpleNamespace(run=run, errors=errors, budget=budget)
 
 
@@ -302,10 +304,10 @@ def test_signs_and_powers_of_ten_sort_as_numbers(opened):
 
 def test_a_pointer_reads_the_maps(asked, opened):
     """At a point of the grid the reading is the map's own value."""
-    best = asked.run.chips[0].best_map
+    best = asked.run.evaluation.maps[0]
     opened.execute_script(
         "const s = document.getElementById('map-layer'); s.value = arguments[0];"
-        "s.dispatchEvent(new Event('change'));", str(len(asked.run.chips[0].maps) - 1))  # fmt: skip
+        "s.dispatchEvent(new Event('change'));", "1")  # fmt: skip
     reading = opened.execute_script(
         "const c = document.querySelector('#map-reader .chip'), b = c.getBoundingClientRect();"
         "c.dispatchEvent(new PointerEvent('pointermove',"
@@ -330,13 +332,13 @@ def test_the_page_is_as_wide_as_the_screen(opened, width):
 @pytest.fixture
 def wide(asked, opened, tmp_path):
     """A page of its own whose numbers are as long as any: daggers, two chips, names of files."""
-    bad = report_input(size=(4096.0, 2048.0), names=("WFC2", "WFC1"), converged=False)
+    bad = report_run(size=(4096.0, 2048.0), names=("WFC2", "WFC1"), converged=False)
     long = "0461802ej_idc.fits, 0461802ej_d2i.fits, 0461802ej_npl.fits, forward"
     terms = (*TERMS, file_term(long, "the file as it was read back"))
     options = {"terms": terms, "grid": GRID, "n_draws": DRAWS, "pixel_scale": SCALE}
     rng = np.random.default_rng(1)
     budget = detector_budget(bad.solution, epoch=2010.3, rng=rng, **options)
-    write_report(tmp_path / "report.html", replace(bad, budget=budget), {})
+    write_report(tmp_path / "report.html", bad.having(budget=budget), {})
     before = opened.current_window_handle
     opened.switch_to.new_window("tab")
     opened.get((tmp_path / "report.html").as_uri())

@@ -19,7 +19,7 @@ from bayesdist.assess.model import error_model
 from bayesdist.report.sections.explorer import budget_data
 from tests.budgets import Curvature
 
-from .runs import report_input
+from .runs import report_run
 
 NODE = shutil.which("node")
 SCRIPT = Path(bayesdist.report.__file__).parent / "templates" / "budget.js"
@@ -40,11 +40,11 @@ console.log(JSON.stringify(epochs.map(t => {
 @pytest.mark.skipif(NODE is None, reason="there is no Node")
 def test_three_errors_at_five_epochs_are_those_of_the_budget(tmp_path):
     """Over a chip, at a position, of a difference: where the drift of the run is curved."""
-    run = report_input(size=(4096.0, 2048.0), names=("WFC2", "WFC1"))
+    run = report_run(size=(4096.0, 2048.0), names=("WFC2", "WFC1"))
     terms = (Curvature(run.solution, 1e-4),)
     errors = error_model(run.solution, terms=terms).drawn(400, np.random.default_rng(9))
     surface = budget_surface(errors, GRID, epoch=2010.3, years=(EPOCHS[0], EPOCHS[-1]))
-    data = budget_data(replace(run, surface=surface))
+    data = budget_data(run.having(surface=surface))
     data |= {"asked": {"epochs": EPOCHS, "a": A, "b": B}}
     (tmp_path / "data.json").write_text(json.dumps(data))
     command = [str(NODE), "-e", ASK, str(SCRIPT), str(tmp_path / "data.json")]

@@ -10,19 +10,21 @@ import numpy as np
 import pytest
 from lxml import html as lxml_html
 
+from bayesdist.app.artefacts.parts import StoredLookupTables
+from bayesdist.assess.solution import coefficient_table
 from bayesdist.diagnose.checks import structure_checks
 from bayesdist.diagnose.residuals.misfit import Misfit
 from bayesdist.infer import GaussianPriors, fit_linear
 from bayesdist.kinds.campaign.checks import campaign_checks
-from bayesdist.kinds.campaign.report import held_parameters
+from bayesdist.kinds.campaign.kind import held_by_prior
+from bayesdist.kinds.campaign.report.lookup import binned_of, largest_cell, rms_of_cells
+from bayesdist.kinds.campaign.report.series import course_of, line_error
 from bayesdist.missions.hst.published import LINES, published_lines
 from bayesdist.missions.hst.simulate.distortion import DRIFT
-from bayesdist.model import Chip, TimeDependence
+from bayesdist.model import TimeDependence
 from bayesdist.report.run_report import render_report
 from bayesdist.report.sections import REPORT
-from bayesdist.report.sections.campaign.lookup import binned_of, largest_cell, rms_of_cells
-from bayesdist.report.sections.campaign.series import course_of, line_error
-from bayesdist.report.sections.run.coefficients import coefficient_tables
+from bayesdist.report.sections.run.coefficients import _parameter_table, coefficient_tables
 from bayesdist.report.sections.run.fit import fit_tables
 from bayesdist.report.texttable import check_cells
 
@@ -36,7 +38,7 @@ MOST_MARKERS = 20_000
 
 @pytest.fixture(scope="module")
 def run():
-    return campaigns.campaign_input()
+    return campaigns.campaign_run()
 
 
 @pytest.fixture(scope="module")
@@ -93,8 +95,8 @@ def test_binned_residuals_of_rolled_exposures_say_along_which_axes(run, campaign
     text = campaign_plots["residual_vectors"].text
     assert "cells of the test for structure" in text
     assert "axes of the polynomials" not in text  # frames that only shift turn nothing
-    turning = replace(run.fit, model=replace(run.fit.model, frames="shift_rotation"))
-    text = plot_of(replace(run, fit=turning), "residual_vectors").text
+    turning = replace(run.fit, model=replace(run.model, frames="shift_rotation"))
+    text = plot_of(run.having(fit=turning), "residual_vectors").text
     assert "axes of the polynomials" in text
 
 
@@ -108,7 +110,7 @@ def test_no_figure_has_more_markers_than_a_reader_can_tell_apart(plan):
 
 
 def test_captions_say_the_numbers_of_the_summary(run, plan):
-    found = run.campaign.summary
+    found = run.summary
     matching, tables = found["matching"], found["tables"]
     text = plan["matching"].text
     assert f"{100 * matching['completeness']['median']:.1f}" in text
@@ -124,7 +126,7 @@ def test_captions_say_the_numbers_of_the_summary(run, plan):
 
 def test_maps_of_residuals_tell_the_pattern_from_noise(run, plan):
     without, with_tables = (
-        binned_of(run.campaign.residuals, which) for which in ("without", "with")
+        binned_of(run.report_data.residuals, which) for which in ("without", "with")
     )
     mean, noise = rms_of_cells(*without)
     assert mean > 5 * noise
@@ -137,7 +139,7 @@ def test_maps_of_residuals_tell_the_pattern_from_noise(run, plan):
 
 
 def test_the_overlap_shows_what_the_old_files_leave(run, plan):
-    test = run.campaign.overlap
+    test = run.diagnostics.overlap
     sigma = 0.001 / 0.05  # pixels on each axis
     n = test.n_stars
     rms = np.sqrt(np.mean(test.new.rms**2))
@@ -162,11 +164,9 @@ def lines_of(run, term):
 def test_rows_of_the_lines_are_those_of_the_summary(run, term):
     table = lines_of(run, term)
     factor = 1e3 if term == "B_1" else 1e6
-    numbers = {c.name: c.number for c in run.campaign.chips}
-    joint = {
-        (r["chip"], r["epoch0"]): r for r in run.campaign.summary["lines"] if r["term"] == term
-    }
-    alone = {(r["term"], r["epoch0"]): r for r in run.campaign.summary["time_dependence"]["lines"]}
+    numbers = {c.name: c.number for c in run.model.chips}
+    joint = {(r["chip"], r["epoch0"]): r for r in run.summary["lines"] if r["term"] == term}
+    alone = {(r["term"], r["epoch0"]): r for r in run.summary["time_dependence"]["lines"]}
     seen = 0
     for chip, rdate, source, *cells in table.rows:
         if source == "joint fit":
@@ -267,9 +267,9 @@ def _believed(table):
 
 
 def test_tables_of_a_filter_have_figures_of_their_own(run):
-    chips = run.campaign.chips
+    chips = run.model.chips
     both = tuple(campaigns.pattern(c.number, f) for f in ("", "F814W") for c in chips)
-    changed = replace(run, tables=both)
+    changed = run.having(tables=StoredLookupTables(both))
     names = {"table_nodes", "table_nodes_F814W", "table_errors_F814W", "residuals_without_tables"}
     plan = plots_of(changed, *names)
     assert set(plan) == names
@@ -279,14 +279,16 @@ def test_tables_of_a_filter_have_figures_of_their_own(run):
 
 
 def test_a_campaign_without_tables_drift_and_overlap(run):
-    bare = {k: v for k, v in run.campaign.summary.items() if k in ("matching", "gauge", "scatter")}
-    one = run.campaign.residuals
+    bare = {k: v for k, v in run.summary.items() if k in ("matching", "gauge", "scatter")}
+    one = run.report_data.residuals
     plain = tuple(replace(c, with_tables=None, binned_with=None) for c in one)
-    less = replace(
-        run.campaign, summary=bare | {"tables": {"method": "none"}}, residuals=plain,
-        series=None, overlap=None, catalog=None, detections=None,
-    )  # fmt: skip
-    small = replace(run, campaign=less, tables=())
+    less = replace(run.report_data, residuals=plain, series=None, catalog=None, detections=None)
+    small = run.having(
+        report_data=less,
+        summary=bare | {"tables": {"method": "none"}},
+        overlap=None,
+        tables=StoredLookupTables(),
+    )
     page = render_report(small, drawings_of(plots_of(small)))
     parsed(page)
     shown = lxml_html.fromstring(page).get_element_by_id("campaign").xpath(".//figure/@id")
@@ -294,15 +296,15 @@ def test_a_campaign_without_tables_drift_and_overlap(run):
 
 
 def test_series_without_rolls_are_drawn_against_time_only(run):
-    series = run.campaign.series
+    series = run.report_data.series
     bare = replace(series, pa_v3=np.full(len(series.pa_v3), np.nan))
-    plot = plot_of(replace(run, campaign=replace(run.campaign, series=bare)), "series_A_2")
+    plot = plot_of(run.having(report_data=replace(run.report_data, series=bare)), "series_A_2")
     assert len(plot.figure.axes) == 6  # three states of two chips
     assert "PA_V3" not in plot.text
 
 
 def test_many_chips_have_several_figures(run):
-    series = run.campaign.series
+    series = run.report_data.series
     table = series.exposures.copy()
     for column in ("WFC2.A_2", "sigma_WFC2.A_2"):
         table[column.replace("WFC2", "WFC3")] = table[column]
@@ -311,25 +313,21 @@ def test_many_chips_have_several_figures(run):
         drift[column.replace("WFC2", "WFC3")] = drift[column]
     lines = [*campaigns.lines_alone()]
     lines += [r | {"term": "WFC3.A_2"} for r in lines if r["term"] == "WFC2.A_2"]
-    time = run.campaign.summary["time_dependence"] | {"lines": lines}
-    more = replace(
-        run.campaign,
-        series=replace(series, exposures=table, drift=drift),
-        summary=run.campaign.summary | {"time_dependence": time},
-        chips=(*run.campaign.chips, Chip(3, "WFC3", campaigns.SIZE, (1.0, 1.0))),
-    )
-    assert plot_of(replace(run, campaign=more), "series_A_2_2").figure.axes
+    time = run.summary["time_dependence"] | {"lines": lines}
+    more = replace(run.report_data, series=replace(series, exposures=table, drift=drift))
+    summary = run.summary | {"time_dependence": time}
+    assert plot_of(run.having(report_data=more, summary=summary), "series_A_2_2").figure.axes
 
 
 # -- status ---------------------------------------------------------------------------------------
 
 
-def levels(campaign):
-    return {c.name: c.level for c in campaign_checks(campaign.summary)}
+def levels(summary):
+    return {c.name: c.level for c in campaign_checks(summary)}
 
 
 def test_a_good_campaign_passes(run):
-    assert set(levels(run.campaign).values()) <= {"pass", "note"}
+    assert set(levels(run.summary).values()) <= {"pass", "note"}
 
 
 @pytest.mark.parametrize(
@@ -343,14 +341,14 @@ def test_a_good_campaign_passes(run):
     ],
 )
 def test_what_went_wrong_is_on_top(run, section, changes, name):
-    found = run.campaign.summary
-    bad = replace(run.campaign, summary=found | {section: found[section] | changes})
+    found = run.summary
+    bad = found | {section: found[section] | changes}
     warned = [n for n, level in levels(bad).items() if level == "warn"]
     assert len(warned) == 1 and name in warned[0]
 
 
 def test_doubts_are_on_top(run):
-    found = run.campaign.summary
+    found = run.summary
     section = found["time_dependence"] | {"warnings": ["the rates are doubtful"]}
     *_, last = campaign_checks(found | {"time_dependence": section})
     assert last.level == "warn" and check_cells(last)[0] == "The rates are doubtful"
@@ -363,7 +361,7 @@ def row_of_structure(misfits):
 
 def test_what_the_banner_warns_of_has_a_row(run):
     """The verdict of the row is that of the warning, and doubts of another kind say so."""
-    first, second = (c.chip for c in run.chips)
+    first, second = run.model.chips
     for p, level in ((1.0, "pass"), (2e-4, "pass"), (1e-5, "warn"), (0.0, "warn")):
         found = (Misfit(p, "cells", 0.0021, "pix", first), Misfit(1, "rows", 0, "pix", second))
         row = row_of_structure(found)
@@ -373,7 +371,7 @@ def test_what_the_banner_warns_of_has_a_row(run):
 
 
 def test_no_structure_is_no_length(run):
-    chip = run.chips[0].chip
+    chip = run.model.chips[0]
     assert row_of_structure((Misfit(1.0, "rows", 0.0, "pix", chip),)).value == "none, p = 1.0"
 
 
@@ -389,7 +387,7 @@ def test_held_parameters_are_no_rows(run):
     before, note = time_rows(run)
     assert "Held" not in note
     rate = next(name for name in before if name.startswith("WFC2.tdd"))
-    held = replace(run, held=frozenset({rate}))
+    held = run.having(held_parameters=frozenset({rate}))
     after, note = time_rows(held)
     assert [name for name in before if name != rate] == after
     assert f"{rate.rpartition('.')[0]} (rate)" in note
@@ -408,25 +406,24 @@ def test_a_prior_holds_what_the_data_do_not_narrow():
         {wide: (0.0, sigma[wide]), narrow: (0.0, 1e-3 * sigma[narrow]),
          frame: (0.0, 1e-3 * sigma[frame])},
     )  # fmt: skip
-    assert held_parameters(fit_linear(table, model, priors=priors), priors) == (narrow,)
-    assert held_parameters(free, GaussianPriors.none(model)) == ()
+    assert held_by_prior(fit_linear(table, model, priors=priors), priors) == {narrow}
+    assert not held_by_prior(free, GaussianPriors.none(model))
 
 
 def test_the_terms_that_were_asked_for_are_named(run):
     time = TimeDependence((("u", 1, 0), ("u", 0, 0)), (2009.0, 2011.0), (2010.0,))
-    model = replace(run.fit.model, time=time)
+    model = replace(run.model, time=time)
     every = [p.name for p in model.parameters if p.kind == "tdd" and (p.i, p.j) == (0, 0)]
     held = tuple(n for n in every if n.startswith("WFC1") or ".rate" in n)
-    config = run.config | {"model": {"tdd": {"terms": [["u", 1, 0]]}}}
-    gap = replace(
-        run,
-        config=config,
+    config = run.configuration | {"model": {"tdd": {"terms": [["u", 1, 0]]}}}
+    gap = run.having(
+        configuration=config,
         fit=replace(run.fit, model=model),
-        held=frozenset(held),
+        held_parameters=frozenset(held),
     )
     text = dict(fit_tables(gap)[0].rows)["Time-dependent terms"]
     assert text == "u_1_0; besides, the constants of WFC2 may step at 2010.00"
-    still = replace(gap, held=frozenset(every))
+    still = gap.having(held_parameters=frozenset(every))
     assert dict(fit_tables(still)[0].rows)["Time-dependent terms"] == "u_1_0"
 
 
@@ -435,18 +432,13 @@ def test_small_ratios_are_shown_by_the_million(run):
     units = {row[0]: row[-1] for row in table.rows}
     assert {u for n, u in units.items() if "shift" in n} == {"pix"}
     name = next(n for n in units if "shift" in n)
-    bare = run.coefficients.copy()
+    bare = coefficient_table(run.fit, run.solution)
     k = list(bare["name"]).index(name)
     for column in ("lsq_value", "lsq_sigma", "mean", "sd", "lo68", "hi68", "lo95", "hi95"):
         bare[column][k] *= 1e-7
     bare["unit"][k] = ""
     value, sigma = bare["lsq_value"][k], bare["lsq_sigma"][k]
-    (table,) = [
-        t
-        for t in coefficient_tables(replace(run, coefficients=bare))
-        if t.caption.startswith("Time dependence")
-    ]
-    (row,) = [row for row in table.rows if row[0] == name]
+    (row,) = _parameter_table(run, "", [bare[k]], with_unit=True).rows
     assert row[-1] == "10⁻⁶"
     assert abs(1e-6 * number_in(row[1]) - value) < 0.06 * sigma
     assert number_in(row[2]) == pytest.approx(1e6 * sigma, rel=0.05)

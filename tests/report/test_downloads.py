@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 from lxml import html as lxml_html
 
-from bayesdist.report.contents import EXPLAINED, explanation_of, section_of
+from bayesdist.report.contents import explanation_of, section_of
 from bayesdist.report.figures.figure_numbers import numbers_of
+from bayesdist.report.run import shown_residuals
 from bayesdist.report.run_report import render_report
 from bayesdist.report.sections import REPORT
 from bayesdist.report.sections.run.status import GROUPS
@@ -36,7 +37,7 @@ def test_numbers_are_those_that_are_drawn(converged):
 
 def test_cells_have_their_places_and_values(converged):
     rows = rows_of(numbers_of(plot_of(converged, "coverage").figure))
-    binned = converged.chips[0].binned
+    binned = shown_residuals(converged)[0]
     assert sum(float(r["value"]) for r in rows) == binned.count.sum()
     first = rows[0]
     assert float(first["x"]) == binned.x[0] and float(first["y"]) == binned.y[0]
@@ -67,7 +68,7 @@ def test_numbers_are_in_the_page_and_what_they_hold_cannot_leave_them(converged)
 
 def test_each_section_names_a_page_and_a_heading_that_exist():
     for section in REPORT.sections:
-        page, heading = EXPLAINED[section.name]
+        page, heading = section.explained
         lines = (DOCS / f"{page}.md").read_text("utf-8").splitlines()
         assert not heading or f"## {heading}" in lines, section.name
         assert explanation_of(section.name).startswith(f"bayesdist docs {page}")

@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.quiver import Quiver
 
 from bayesdist.assess import VectorMap
+from bayesdist.assess.vectors import diagram_vectors
 from bayesdist.errors import InputError
 from bayesdist.report.drawing import save_figures
 from bayesdist.report.figures.arrows import Arrows, cross_map, sparse_step, square_cells
@@ -34,12 +35,13 @@ from bayesdist.report.plots.posterior import (
     slowest_parameters,
 )
 from bayesdist.report.plots.residuals import MixtureCurve
+from bayesdist.report.run import shown_maps
 from bayesdist.report.sections.run.data import _density
 from bayesdist.report.sections.run.residuals import _histograms
 from tests.reduced import case_in_full
 
 from .plots import figures_of
-from .runs import SIZE, report_input
+from .runs import SIZE, report_run
 
 WITHOUT_UNIT = {"stars per bin", "stars per hexagon"}  # counts
 CATEGORIES = {"budget_terms", "margins"}  # names, not numbers, along y
@@ -70,7 +72,7 @@ REDUCED = ("two wide chips in arcsec, uniform",)
 )
 def every_figure(request):
     options = RUNS[request.param]
-    figures = figures_of(report_input(**options)) if options else request.getfixturevalue("figures")
+    figures = figures_of(report_run(**options)) if options else request.getfixturevalue("figures")
     for figure in figures.values():
         figure.canvas.draw()
     return figures
@@ -78,7 +80,7 @@ def every_figure(request):
 
 @pytest.fixture(scope="module")
 def wfc():
-    return report_input(**WFC)
+    return report_run(**WFC)
 
 
 def test_every_axis_names_its_unit(every_figure):
@@ -150,7 +152,7 @@ def _drawn_lengths(quiver):
     ("unit", "size"), [("pix", (1016.0, 1016.0)), ("arcsec", (4096.0, 2048.0))]
 )
 def test_key_has_the_length_that_arrows_of_that_value_are_drawn_with(unit, size):
-    run = report_input(size=size, unit=unit, scale=1.0 if unit == "pix" else 0.05)
+    run = report_run(size=size, unit=unit, scale=1.0 if unit == "pix" else 0.05)
     mas = {"mas": 1e-3, "arcsec": 1.0, "pix": 1.0}
     for fig in figures_of(run, "distortion", "distortion_non_linear", "residual_vectors").values():
         fig.canvas.draw()
@@ -173,9 +175,9 @@ def crosses(maps):
 
 
 def test_key_of_the_crosses_is_to_their_scale(converged):
-    fig = crosses(converged.chips[0].maps)
+    fig = crosses(shown_maps(converged)[0])
     fig.canvas.draw()
-    for ax, m in zip(fig.axes, converged.chips[0].maps, strict=True):
+    for ax, m in zip(fig.axes, shown_maps(converged)[0], strict=True):
         stated, _, paper, words = _key(ax)
         assert "×2\u202f000" in words
         (lines,) = [c for c in ax.collections if isinstance(c, LineCollection)]
@@ -225,8 +227,10 @@ def test_each_chip_has_a_panel_where_it_lies(wfc):
 def test_vectors_of_all_chips_are_in_one_focal_plane(wfc):
     """WFC1 is 30 pixels above WFC2, and the longest arrow is as long as a cell of the grid."""
     for name, fig in figures_of(wfc, "distortion", "distortion_non_linear").items():
-        which = {"distortion": "displacement", "distortion_non_linear": "non_linear"}[name]
-        vectors = [getattr(c, which) for c in wfc.chips]
+        part = {"distortion": "no_constant", "distortion_non_linear": "non_linear"}[name]
+        vectors = [
+            diagram_vectors(wfc.solution, chip, part=part, epoch=2010.3) for chip in wfc.model.chips
+        ]
         ax, bar = fig.axes
         low, high = (patch.get_xy()[:4] for patch in ax.patches[:2])
         assert np.ptp(low, axis=0) == pytest.approx((4096, 2048), rel=1e-6)
@@ -311,7 +315,7 @@ def test_bars_of_each_chip_stand_beside_those_of_all(wfc):
         "rms over WFC2",
         "rms over WFC1",
     ]
-    parts = [wfc.budget.rows(), *(b.rows() for b in wfc.budget.chips)]
+    parts = [b.rows() for b in (wfc.evaluation.budget, *wfc.evaluation.budget.chips)]
     for ax, rows in zip(fig.axes, parts, strict=True):
         widths = [bar.get_width() for bar in ax.patches]
         np.testing.assert_allclose(widths, [r["radial"] / np.sqrt(2) for r in rows], rtol=1e-12)
@@ -319,7 +323,7 @@ def test_bars_of_each_chip_stand_beside_those_of_all(wfc):
 
 
 def test_crosses_reach_all_four_combinations_of_one_sigma(converged):
-    m = converged.chips[0].formal_map
+    m = converged.evaluation.formal[0]
     fig = crosses((m,))
     (lines,) = [c for c in fig.axes[0].collections if isinstance(c, LineCollection)]
     steps = np.array([s[1] - s[0] for s in lines.get_segments()]) / 2000.0
@@ -331,7 +335,7 @@ def test_crosses_reach_all_four_combinations_of_one_sigma(converged):
 
 def test_the_largest_error_is_printed(converged, figures):
     fig = figures["formal_uncertainty"]
-    for ax, m in zip(fig.axes, converged.chips[0].maps, strict=True):
+    for ax, m in zip(fig.axes, shown_maps(converged)[0], strict=True):
         printed = float(re.search(r"largest ([\d.]+)", ax.get_title(loc="left")).group(1))
         assert printed == pytest.approx(m.radius_max / np.sqrt(2), rel=6e-3)
         assert m.kind in ax.get_title(loc="left")
@@ -365,12 +369,17 @@ def test_vectors_of_a_rotated_frame_are_drawn_along_the_detector():
 
 
 def test_a_map_without_variation_or_vectors_is_drawn(converged):
-    m = converged.chips[0].formal_map
+    m = converged.evaluation.formal[0]
     flat = replace(m, sigma_u=np.full_like(m.sigma_u, 0.01), sigma_v=np.full_like(m.sigma_v, 0.01))
-    v = converged.chips[0].displacement
-    still = replace(v, du=0.0 * v.du, dv=0.0 * v.dv)
-    chip = replace(converged.chips[0], formal_map=flat, posterior_map=None, displacement=still)
-    run = replace(converged, chips=(chip,))
+    model, theta = converged.model, np.zeros(converged.model.n_params)
+    basis = model.basis()
+    for axis, term in enumerate([(1, 0), (0, 1)]):
+        monomials = [float(other == term) for other in basis.terms]
+        theta[model.coefficient_slice(None, axis)] = basis.from_monomials(monomials)
+    draws = np.broadcast_to(theta, converged.posterior.theta.shape)
+    still = replace(converged.posterior, theta=draws)
+    assert diagram_vectors(still, model.chips[0], epoch=2010.3).length_max < 1e-9
+    run = converged.having(formal=(flat,), maps=(flat,), posterior=still)
     drawn = figures_of(run, "uncertainty_radius", "distortion")
     for fig in drawn.values():
         fig.canvas.draw()
@@ -413,24 +422,24 @@ def test_a_million_stars_are_drawn_as_counts():
 def test_every_star_of_a_histogram_is_counted(converged, figures):
     fig = figures["residual_histogram"]
     bars = fig.axes[2].patches[0]  # all stars of u
-    assert bars.get_data().values.sum() == converged.stars.n_total == 6000
+    assert bars.get_data().values.sum() == converged.diagnostics.sample.n_total == 6000
 
 
 def test_residuals_are_the_data_minus_the_model(converged):
     """By the model's own prediction, which takes another way than the passes over the data."""
-    t = converged.stars.table
+    t = converged.diagnostics.sample.table
     where = {"exposure": t.exposure, "epoch": t.epoch}
     for solution, found in (
-        (converged.fit, converged.stars.fit_residual),
-        (converged.posterior, converged.stars.residual),
+        (converged.fit, converged.diagnostics.sample.fit_residual),
+        (converged.posterior, converged.diagnostics.sample.residual),
     ):
         model = solution.model.predict(solution.mean, t.x, t.y, **where)
         np.testing.assert_allclose(found, np.column_stack([t.u, t.v]) - model, atol=1e-9)
 
 
 def test_figures_of_some_stars_say_so_and_show_no_others():
-    run = report_input(shown=1500)
-    assert run.stars.partial and len(run.stars) == 1500
+    run = report_run(shown=1500)
+    assert run.diagnostics.sample.partial and len(run.diagnostics.sample) == 1500
     figs = figures_of(run, "residual_histogram", "residuals_by_magnitude")
     histogram = figs["residual_histogram"]
     bars, curve = histogram.axes[2].patches[0].get_data(), histogram.axes[2].lines[0]
@@ -504,7 +513,7 @@ def test_levels_of_errors_are_logarithmic_and_many(low, high):
 def test_at_most_thirteen_crosses_stand_on_an_axis(converged, n):
     x = np.linspace(1.0, 1016.0, n)
     values = np.ones((n, n))
-    m = replace(converged.chips[0].formal_map, x=x, y=x, sigma_u=values, sigma_v=values)
+    m = replace(converged.evaluation.formal[0], x=x, y=x, sigma_u=values, sigma_v=values)
     rows, columns = square_cells(m.x, m.y, sparse_step([m]))
     shown = x[columns]
     assert len(x[rows]) == len(shown) <= 13

@@ -21,10 +21,11 @@ from bayesdist.utils.checks import Check
 
 
 def test_each_requirement_has_value_limit_and_probability_in_the_unit_of_its_limit(converged):
-    run = replace(converged, config={"detector": {"scale_mas": 2750.0}})
+    settings = replace(converged.evaluation.settings, scale_mas=2750.0)
+    run = converged.having(settings=settings)
     lines = requirement_lines(run)
-    assert len(lines) == len(run.margins) > 1
-    for m, line in zip(run.margins, lines, strict=True):
+    assert len(lines) == len(run.evaluation.margins) > 1
+    for m, line in zip(run.evaluation.margins, lines, strict=True):
         assert line.verdict == m.verdict.upper()
         found = re.search(
             r"([\d.]+)\u202fpix \(([\d.]+)\u202f(mas|arcsec)\), limit ([\d.]+)\u202fpix", line.text
@@ -39,22 +40,21 @@ def test_each_requirement_has_value_limit_and_probability_in_the_unit_of_its_lim
 
 def test_lengths_on_a_focal_plane_are_given_in_micrometres(converged):
     """Angles over the plate scale; a pixel has none, and stays as it is."""
-    run = replace(converged, config={"data": {"plate_scale": 20.0}})
-    angles = tuple(replace(m, unit="mas", value=3.0) for m in run.margins)
-    for line in requirement_lines(replace(run, margins=angles)):
+    run = converged.having(configuration={"data": {"plate_scale": 20.0}})
+    angles = tuple(replace(m, unit="mas", value=3.0) for m in run.evaluation.margins)
+    for line in requirement_lines(run.having(margins=angles)):
         assert "\u202fmas (0.150\u202fµm), limit" in line.text  # 3 mas / (20 arcsec / mm)
     assert not any("µm" in line.text for line in requirement_lines(run))
 
 
 def test_positions_off_the_field_are_left_out_of_the_first_sentence(converged):
     """The map is NaN there: the errors are those of the positions that see the sky."""
-    chip = converged.chips[0]
-    kept = np.zeros(chip.best_map.sigma_u.shape, bool)
+    (whole,) = converged.evaluation.maps
+    kept = np.zeros(whole.sigma_u.shape, bool)
     kept[1, 2] = True
     names = ("sigma_u", "sigma_v", "correlation")
-    whole = chip.best_map
     seen = replace(whole, **{name: np.where(kept, getattr(whole, name), np.nan) for name in names})
-    field = replace(converged, chips=[replace(chip, posterior_map=seen)])
+    field = converged.having(maps=(seen,))
     (size,) = np.hypot(whole.sigma_u[kept], whole.sigma_v[kept]) / np.sqrt(2)
     sentence = verdict(field).sentences[-1]
     found = re.search(r"is ([\d.]+)\u202fpix .*? at most ([\d.]+)\u202fpix", sentence)
@@ -64,14 +64,16 @@ def test_positions_off_the_field_are_left_out_of_the_first_sentence(converged):
 
 def test_probability_near_one_is_a_bound(converged):
     """With n draws in none of which the limit is exceeded, P is stated as above 1 - 1/n."""
-    sure = replace(converged.margins[0], probability_met=1.0, mc_error=0.0, n_effective=1600)
-    (line,) = requirement_lines(replace(converged, margins=(sure,)))
+    sure = replace(
+        converged.evaluation.margins[0], probability_met=1.0, mc_error=0.0, n_effective=1600
+    )
+    (line,) = requirement_lines(converged.having(margins=(sure,)))
     assert line.text.endswith(", P > 0.9993")
 
 
 def test_facts_name_what_was_measured(converged):
     config = {"detector": {"mission": "WISE", "instrument": "", "name": "W2", "filter": "F1"}}
-    run = replace(converged, config=config, provenance={"versions": {"bayesdist": "1.2.3"}})
+    run = converged.having(configuration=config, provenance={"versions": {"bayesdist": "1.2.3"}})
     facts = facts_line(run).split(" · ")
     n = f"{run.fit.n_used:,}".replace(",", "\u202f")
     assert facts[0] == f"{n} of 6\u202f000 stars used"
@@ -99,7 +101,7 @@ def test_figures_and_tables_are_numbered_from_one_in_the_order_of_the_page(page)
 
 def test_rows_that_fail_or_warn_are_open_and_those_that_pass_are_folded(converged):
     rows = [Check("Sampling", "odd", 1.0, "0", "warn"), Check("Fit", "good", 1.0, "2", "pass")]
-    run = replace(converged, checks=tuple(rows))
+    run = converged.having(checks=tuple(rows))
     tree = lxml_html.fromstring(render_report(run, {}))
     status = tree.xpath("//section[@id='status']")[0]
     folded = status.xpath(".//details//span/@class")
@@ -107,7 +109,7 @@ def test_rows_that_fail_or_warn_are_open_and_those_that_pass_are_folded(converge
     shown = status.xpath(".//td/span[not(ancestor::details)]/@class")
     assert "level warn" in shown and "level pass" not in shown
     groups = list(dict.fromkeys(row[0] for row in status_table(run).rows))
-    assert groups == ["Requirements", "Fit", "Sampling", "Products"]
+    assert groups == ["Requirements", "Fit", "Sampling"]
 
 
 def test_a_small_run_has_ten_screens(converged, plots, browser, tmp_path):

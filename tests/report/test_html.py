@@ -16,15 +16,13 @@ from bayesdist.diagnose.checks import structure_checks
 from bayesdist.diagnose.residuals.misfit import Misfit
 from bayesdist.errors import InputError
 from bayesdist.infer.posterior.checks import sampling_checks
-from bayesdist.report.context import Product
 from bayesdist.report.run_report import render_report, write_report
 from bayesdist.report.sections import REPORT
 from bayesdist.report.sections.run.coefficients import coefficient_tables
 from bayesdist.report.sections.run.fit import fit_tables
 from bayesdist.report.sections.run.status import status_checks, verdict
-from bayesdist.utils.checks import Check
 
-from .runs import coefficient_table, report_input
+from .runs import report_run, written
 
 VOID = {"meta", "img", "br", "hr", "input", "link"}
 
@@ -112,20 +110,22 @@ def test_pictures_are_whole_and_described(page, figures):
 
 def test_no_nan_is_ever_printed(converged, drawings):
     fit, c = converged.fit, converged.posterior.convergence
-    table = coefficient_table(fit, converged.posterior)
-    table["sd"][3] = table["rhat"][4] = np.nan
-    holes = replace(
-        converged,
-        coefficients=table,
+    rhat = c.rhat.copy()
+    rhat[4] = np.nan
+    holes = converged.having(
         fit=replace(fit, dof=0, condition=np.nan),
         posterior=replace(
             converged.posterior,
             convergence=replace(
-                c, pareto_k=-np.inf, importance_efficiency=np.nan, mcse_mean=c.mcse_mean * np.nan
+                c,
+                rhat=rhat,
+                pareto_k=-np.inf,
+                importance_efficiency=np.nan,
+                mcse_mean=c.mcse_mean * np.nan,
             ),
         ),
         provenance={"timings": {"fit": float("nan")}, "seed": None, "note": np.float64("nan")},
-        products=(Product("a.fits", "a", (Check("closure", float("nan"), "at most 1", "warn"),)),),
+        summary={"products": [written("a.fits", "a", closure_pix=float("nan"))]},
     )
     assert not re.search(
         r"\b(nan|None|inf)\b", words(render_report(holes, drawings)), re.IGNORECASE
@@ -173,7 +173,7 @@ def test_status_has_each_criterion_with_number_limit_and_outcome(page, converged
     found = {r[0]: r for r in rows}
     rhat = next(r for name, r in found.items() if "R-hat" in name)
     assert float(rhat[1]) == pytest.approx(converged.posterior.convergence.rhat_max, abs=1e-4)
-    for margin in converged.margins:
+    for margin in converged.evaluation.margins:
         row = next(r for name, r in found.items() if name.startswith(margin.requirement.name))
         assert row[3].endswith(
             {"met": "pass", "missed": "FAIL", "not shown": "warn"}[margin.verdict]
@@ -183,20 +183,20 @@ def test_status_has_each_criterion_with_number_limit_and_outcome(page, converged
 def test_a_copy_on_paper_can_be_traced(converged, drawings):
     """By the line below every page, which is a string of the style sheet, and by the footer."""
     made = {"created": "2026-11-22T10:58:32+00:00", "versions": {"bayesdist": "1.2.3"}}
-    run = replace(converged, name='a "W2" </style>', provenance=made)
+    run = converged.having(title='a "W2" </style>', provenance=made)
     text = render_report(run, drawings)
     maker = "bayesdist 1.2.3 in a run of 2026-11-22 10:58:32 UTC"
     tree = lxml_html.fromstring(text)
     assert tree.xpath("//footer")[0].text_content().startswith(f"Made by {maker}. ")
     [line] = re.findall(r'@bottom-left { content: "(.*?)"; }', tree.xpath("//style")[0].text)
     said = re.sub(r"\\([0-9a-f]+) ", lambda m: chr(int(m[1], 16)), line)
-    assert said == f"{run.name} · {maker}"
-    assert "Made by bayesdist. " in render_report(replace(converged, provenance={}), drawings)
+    assert said == f"{run.title} · {maker}"
+    assert "Made by bayesdist. " in render_report(converged.having(provenance={}), drawings)
 
 
 def test_files_are_named_without_the_folder_that_all_are_in(converged):
     paths = {"/data/a/x.ecsv": "0", "/data/a/lists/y.ecsv": "1"}
-    run = replace(converged, provenance={"inputs": paths})
+    run = converged.having(provenance={"inputs": paths})
     tree = lxml_html.fromstring(render_report(run, {}))
     rows = tree.xpath("//section[@id='provenance']//table[caption='Inputs']//th")
     assert [row.text_content() for row in rows] == ["x.ecsv", "lists/y.ecsv"]
@@ -206,21 +206,21 @@ def test_negative_numbers_have_a_minus(page, converged):
     tree = lxml_html.fromstring(page)
     cells = [c.text_content() for c in tree.xpath("//table//td[contains(@class, 'n')]")]
     assert not [text for text in cells if re.search(r"(^|[ (])-", text)]
-    missed = next(m for m in converged.margins if m.verdict == "missed")
+    missed = next(m for m in converged.evaluation.margins if m.verdict == "missed")
     row = tree.xpath(f"//section[@id='margins']//tr[th='{missed.requirement.name}']")[0]
     assert f"(\N{MINUS SIGN}{abs(missed.percent):.0f}\u202f%)" in row.text_content()
 
 
 def _only(run, *verdicts):
-    return replace(run, margins=tuple(m for m in run.margins if m.verdict in verdicts))
+    return run.having(margins=tuple(m for m in run.evaluation.margins if m.verdict in verdicts))
 
 
 def test_verdict_in_words(converged, not_converged):
-    assert {m.verdict for m in converged.margins} == {"met", "missed", "not shown"}
+    assert {m.verdict for m in converged.evaluation.margins} == {"met", "missed", "not shown"}
     assert verdict(_only(converged, "met")).level == "pass"
     assert verdict(_only(converged, "met", "not shown")).level == "warn"
-    doubted = [replace(m, verdict="undecided") for m in _only(converged, "met").margins]
-    run = replace(converged, margins=(*converged.margins, *doubted))
+    doubted = [replace(m, verdict="undecided") for m in _only(converged, "met").evaluation.margins]
+    run = converged.having(margins=(*converged.evaluation.margins, *doubted))
     assert verdict(_only(run, "met", "undecided")).level == "warn"
     assert "is undecided and 1 not shown" in verdict(_only(run, "undecided", "not shown")).headline
     assert verdict(_only(converged, "met", "not shown", "missed")).level == "fail"
@@ -229,11 +229,8 @@ def test_verdict_in_words(converged, not_converged):
     assert nothing.headline.startswith("No requirement was stated")
     assert "No requirement" not in " ".join(nothing.sentences)  # once is enough
     assert verdict(_only(not_converged)).level == "fail"
-    assert verdict(_only(report_input(sampler=False))).level == "warn"
-    broken = Product(
-        "x.fits", "x", (Check("Products", "closure [pix]", 1.0, "at most 0.001", "fail"),)
-    )
-    assert verdict(replace(_only(converged), products=(broken,))).level == "fail"
+    broken = {"products": [written("x.fits", "x", "error: it has no inverse")]}
+    assert verdict(_only(converged).having(summary=broken)).level == "fail"
 
 
 def test_one_limit_missed_is_one_failure(converged):
@@ -248,26 +245,25 @@ def test_one_limit_missed_is_one_failure(converged):
 
 def test_structure_in_the_residuals_has_a_row(converged):
     """The verdict of the row is that of the warning, whichever chip it is of."""
-    (chip,) = (c.chip for c in converged.chips)
+    (chip,) = converged.model.chips
     for p, level in ((0.3, "pass"), (2e-4, "pass"), (1e-5, "warn")):
         found = Misfit(p, "columns", 0.0021, "pix", chip)
         assert found.significant == (level == "warn")
-        checks = (*converged.checks, *structure_checks((found,)))
-        *_, row = status_checks(replace(converged, checks=checks))["Fit"]
+        checks = (*converged.evaluation.checks, *structure_checks((found,)))
+        *_, row = status_checks(converged.having(checks=checks))["Fit"]
         assert row.name.startswith("Structure in the residuals") and row.level == level
         assert row.value.startswith("0.0021\u202fpix rms in columns of W2, p ")
 
 
 def test_names_cannot_break_the_page(converged, figures):
     evil = "<script>alert('x')</script> & \"quotes\""
-    run = replace(
-        converged,
-        name=evil,
-        config={"data": {"matches": evil}},
-        stars=replace(
-            converged.stars,
+    run = converged.having(
+        title=evil,
+        configuration={"data": {"matches": evil}},
+        sample=replace(
+            converged.diagnostics.sample,
             table=replace(
-                converged.stars.table,
+                converged.diagnostics.sample.table,
                 sources=(evil,),
                 exposure_names=("<b>", "&amp;", "frame2", "frame3"),
                 rejected={"<i>reason": 3},
@@ -275,10 +271,8 @@ def test_names_cannot_break_the_page(converged, figures):
         ),
         flagged=None,
         fit=converged.fit,
-        posterior=None,
-        chips=tuple(replace(c, posterior_map=None) for c in converged.chips),
         provenance={"command": evil, "inputs": {evil: "0"}},
-        products=(Product(evil, evil, (Check(evil, evil, evil),)),),
+        summary={"products": [written(evil, evil, f"note: {evil}")]},
     )
     out = render_report(run, {})
     assert "<script>alert" not in out and "<b>\n" not in out
@@ -290,7 +284,7 @@ def test_names_cannot_break_the_page(converged, figures):
 
 def test_a_page_of_some_stars_says_of_how_many(converged):
     """What is drawn from a sample is marked; what is counted, is counted over all stars."""
-    page = render_report(report_input(shown=1500), {})
+    page = render_report(report_run(shown=1500), {})
     text = words(page)
     assert "a sample of 1\u202f500 of 6\u202f000 stars" in text
     whole = words(render_report(converged, {}))
@@ -308,18 +302,10 @@ def test_a_page_of_some_stars_says_of_how_many(converged):
         assert row(page, head) == row(render_report(converged, {}), head)
 
 
-def test_least_squares_alone_makes_a_page():
-    run = report_input(sampler=False)
-    text = words(render_report(run, {}))
-    assert "Least squares only" in text
-    assert "NOT CONVERGED" not in text
-    assert not re.search(r"\b(nan|None)\b", text)
-
-
 def test_legendre_and_monomial_tables_hold_the_same_polynomial(converged):
     """The two printed forms, read back, put a star at the same place."""
     legendre, _, monomial = coefficient_tables(converged)
-    basis = converged.fit.model.basis(1)
+    basis = converged.model.basis(1)
     x, y = np.array([200.0, 700.0]), np.array([300.0, 150.0])
     powers = np.stack([(x - 508.5) ** i * (y - 508.5) ** j for i, j in basis.terms], axis=-1)
 
@@ -346,21 +332,24 @@ def test_the_file_appears_whole_or_not_at_all(converged, drawings, tmp_path):
 
 def test_tables_of_two_chips_name_them():
     """The worst chip in the verdict; every number of a table belongs to a named chip, or to all."""
-    run = report_input(size=(4096.0, 2048.0), names=("WFC2", "WFC1"))
+    run = report_run(size=(4096.0, 2048.0), names=("WFC2", "WFC1"))
     page = render_report(run, {})
     parsed(page)
     text = words(page)
-    worst = max(run.chips, key=lambda c: c.posterior_map.radius_max)
-    x, y = worst.posterior_map.position_of_max
-    assert f"at pixel ({x:.0f}, {y:.0f}) of {worst.chip.name}" in text
+    worst = max(run.evaluation.maps, key=lambda m: m.radius_max)
+    x, y = worst.position_of_max
+    (name,) = (chip.name for chip in run.model.chips if chip.number == worst.chip)
+    assert f"at pixel ({x:.0f}, {y:.0f}) of {name}" in text
     tree = lxml_html.fromstring(page)
     names = [t.text_content() for t in tree.xpath("//section[@id='maps']//tbody//th")]
     assert names == [
         f"{chip}, {kind}" for chip in ("WFC2", "WFC1") for kind in ("least squares", "posterior")
     ]
     chips = [t.text_content() for t in tree.xpath("//section[@id='budget']//tbody//td[1]")]
-    n_parts = sum(term.of_parameters for term in run.budget.terms)
-    n_rows = len(run.budget.rows()) - n_parts + 1  # the parts of the model jointly, then alone
+    n_parts = sum(term.of_parameters for term in run.evaluation.budget.terms)
+    n_rows = (
+        len(run.evaluation.budget.rows()) - n_parts + 1
+    )  # the parts of the model jointly, then alone
     expected = [c for n in (n_rows, n_parts) for c in ("all", "WFC2", "WFC1") for _ in range(n)]
     assert n_parts > 1 and chips == expected
     for chip in ("WFC1", "WFC2"):
@@ -368,15 +357,17 @@ def test_tables_of_two_chips_name_them():
 
 
 def test_the_residuals_of_a_table_are_those_of_its_chip():
-    run = report_input(size=(4096.0, 2048.0), names=("WFC2", "WFC1"))
+    run = report_run(size=(4096.0, 2048.0), names=("WFC2", "WFC1"))
     table = next(t for t in fit_tables(run) if "Geometry" not in t.caption and len(t.rows) == 6)
     labels = [row[0] for row in table.rows]
     assert labels == [f"{c}, {a}" for c in ("all", "WFC2", "WFC1") for a in "uv"]
-    t = run.stars.table
+    t = run.diagnostics.sample.table
     for row in table.rows:
         chip, axis = row[0].split(", ")
-        here = run.stars.used & (np.isin(t.chip, [t.chip_numbers.index(n) for n in NUMBERS[chip]]))
-        largest = run.stars.fit_residual[here, "uv".index(axis)].max()
+        here = run.diagnostics.sample.used & (
+            np.isin(t.chip, [t.chip_numbers.index(n) for n in NUMBERS[chip]])
+        )
+        largest = run.diagnostics.sample.fit_residual[here, "uv".index(axis)].max()
         assert float(row[4].replace("\u2212", "-")) == pytest.approx(largest, abs=6e-4)
 
 
@@ -393,13 +384,13 @@ def test_what_residuals_were_asked_and_verdicts_rest_on_stands_on_the_page(conve
         ScoreTest("gap", 0.4, p_value=0.52, size=0.0, smallest=0.003, significant=False,
                   remedy="add terms", finding="No drift", **common | {"unit": "pix/yr"}),
     )  # fmt: skip
-    first, *rest = converged.margins
+    first, *rest = converged.evaluation.margins
     margins = (
         replace(first, rests_on=("a polynomial of order 4", "no held-out stars")),
         *(replace(m, rests_on=("a polynomial of order 4",)) for m in rest),
     )
     tree = lxml_html.fromstring(
-        render_report(replace(converged, score_tests=asked, margins=margins), {})
+        render_report(converged.having(score_tests=asked, margins=margins), {})
     )
     found = tree.xpath("//section[@id='fit']//tr[th='order 5']")[0].text_content()
     assert "2.0 × 10⁻⁹" in found.replace("\u202f", " ") and "found: raise model.order to 5" in found
@@ -414,8 +405,8 @@ def test_what_residuals_were_asked_and_verdicts_rest_on_stands_on_the_page(conve
 
 def test_simulated_data_are_named_on_every_page(converged, drawings, page):
     """In a band on the screen, in the title, and in the margin of each page of paper."""
-    config = {**converged.config, "data": {"simulated": True}}
-    text = render_report(replace(converged, config=config), drawings)
+    config = {**converged.configuration, "data": {"simulated": True}}
+    text = render_report(converged.having(configuration=config), drawings)
     tree = lxml_html.fromstring(text)
     (band,) = tree.xpath("//p[@class='simulated']")
     assert "SIMULATED" in band.text_content() and "SIMULATED" in tree.xpath("//title")[0].text

@@ -32,7 +32,7 @@ def test_the_table_says_what_its_errors_hold_for(converged, model, said):
     radius = 3.0 if model == "uniform" else None
     mixture = replace(post.mixture, model=model, match_radius=radius)
     note = outlier_table(
-        replace(converged, posterior=replace(post, mixture=mixture, hyper=hyper))
+        converged.having(posterior=replace(post, mixture=mixture, hyper=hyper))
     ).note
     assert said is None or f"The {said} for false matches of this shape" in note
     assert ("of this shape" in note) == (said is not None)

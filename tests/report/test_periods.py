@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from lxml import html as lxml_html
@@ -21,7 +19,7 @@ from bayesdist.report.run_report import render_report
 from bayesdist.report.sections.run.periods import period_tables
 
 from .plots import plot_of
-from .runs import report_input
+from .runs import report_run
 
 SIZE = (1000.0, 800.0)
 MODEL = DistortionModel(2, (Chip(1, "A", SIZE, (500.5, 400.5)),))
@@ -61,7 +59,7 @@ def test_vectors_are_the_difference_of_the_two_models(found, pairs):
         inside = (pairs.epoch >= start) & (pairs.epoch < stop)
         A = designed(pairs.x[inside], pairs.y[inside])
         cov = cov + (0.05 * found.comparison.error_scale) ** 2 * np.linalg.inv(A.T @ A)
-    figure = plot_of(replace(report_input(size=SIZE), periods=found), "period_differences").figure
+    figure = plot_of(report_run(size=SIZE).having(periods=found), "period_differences").figure
     drawn = [one for ax in figure.axes for one in ax.collections if isinstance(one, Quiver)]
     late, early = (found.comparison.means[k] for k in (2, 0))
     colors = set()
@@ -82,7 +80,7 @@ def test_vectors_are_the_difference_of_the_two_models(found, pairs):
 
 
 def test_the_section_has_what_was_found(converged, drawings, found):
-    inputs = replace(converged, periods=found)
+    inputs = converged.having(periods=found)
     tables = period_tables(inputs)
     assert [t.caption.split(":")[0] for t in tables] == [
         "Does the distortion change?",

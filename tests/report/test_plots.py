@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import doctest
 import re
-from dataclasses import replace
 from types import SimpleNamespace
 
 import matplotlib
@@ -22,6 +21,7 @@ import bayesdist as bd
 from bayesdist.assess import Requirement, distortion_vectors
 from bayesdist.assess.evaluation import EvaluationSettings
 from bayesdist.assess.requirements.margins import ValidityPeriod
+from bayesdist.assess.vectors import diagram_vectors
 from bayesdist.errors import InputError
 from bayesdist.report import html, plots
 from bayesdist.report.figures.arrows import Arrows
@@ -29,38 +29,20 @@ from bayesdist.report.figures.figure_numbers import numbers_of
 from bayesdist.report.figures.style import INK, PAPER, Tones
 from bayesdist.report.plots import errors, maps
 from bayesdist.report.plots.posterior import Column, contour_heights, draw_corner
+from bayesdist.report.run import shown_maps, shown_residuals
 from bayesdist.report.run_plots import RunPlots
 
 from .plots import figures_of
-from .runs import report_input
+from .runs import report_run
 
 STYLES = ("default", "dark_background", "seaborn-v0_8", "ggplot")
 SCALE = 2757.0  # mas
 WFC = {"size": (4096.0, 2048.0), "names": ("WFC2", "WFC1")}
 
 
-def run_plots(r, **parts) -> RunPlots:
-    """Plots of a run, with what they take from its diagnostics and its evaluation."""
-    shown = tuple(SimpleNamespace(residuals=lambda c=c: c.binned) for c in r.chips)
-    evaluation = {
-        "settings": EvaluationSettings(epoch=2010.3, scale_mas=SCALE),
-        "formal": tuple(c.formal_map for c in r.chips),
-        "maps": tuple(c.posterior_map for c in r.chips),
-        "relative": (),
-        "budget": r.budget,
-        "margins": r.margins,
-        "validity": (),
-    }
-    run = SimpleNamespace(
-        fit=r.fit,
-        posterior=r.posterior,
-        solution=r.posterior,
-        diagnostics=SimpleNamespace(sample=r.stars, shown=shown),
-        evaluation=SimpleNamespace(**evaluation | parts),
-        errors=SimpleNamespace(by_magnitude=r.magnitude_errors),
-        kind=SimpleNamespace(rows="stars"),
-    )
-    return RunPlots(run)
+def run_plots(run, **parts) -> RunPlots:
+    """Plots of a run with these parts of its evaluation."""
+    return RunPlots(run.having(**parts))
 
 
 @pytest.fixture(scope="module")
@@ -222,7 +204,7 @@ def test_a_plot_has_the_marks_of_the_figure_in_the_report(plot, figures, figure,
 
 
 def test_maps_have_the_marks_of_the_figures_in_the_report(converged, figures):
-    maps = converged.chips[0].maps
+    maps = shown_maps(converged)[0]
     every = np.concatenate([m.per_axis.ravel() for m in maps])
     for k, (m, which) in enumerate(zip(maps, ("formal", "posterior"), strict=True)):
         shared = figures["uncertainty_radius"].axes[k]
@@ -241,7 +223,7 @@ def test_maps_have_the_marks_of_the_figures_in_the_report(converged, figures):
 
 
 def test_a_map_in_mas_has_the_errors_times_the_pixel_scale(plot, converged):
-    m = converged.chips[0].posterior_map
+    m = converged.evaluation.maps[0]
     levels = [0.005, 0.01, 0.02]  # pixels
     ax = plots.plot_map(m, Figure().subplots(), scale_mas=SCALE, levels=levels)
     (filled,) = [c for c in ax.collections if getattr(c, "filled", False)]
@@ -278,12 +260,12 @@ def test_the_key_is_to_the_scale_of_the_vectors(plot, converged, kind, mas):
     for c in ax.collections:
         if isinstance(c, Quiver):
             assert 1.0 / c.scale == pytest.approx(magnification)
-            vectors = converged.chips[0].displacement
+            vectors = diagram_vectors(converged.solution, converged.model.chips[0], epoch=2010.3)
             assert np.hypot(c.U, c.V).max() == pytest.approx(vectors.length_max)
 
 
 def test_vectors_of_residuals_are_those_of_the_cells(plot, converged):
-    binned = converged.chips[0].binned
+    binned = shown_residuals(converged)[0]
     ax = plot.residuals(Figure().subplots())
     quivers = [c for c in ax.collections if isinstance(c, Quiver)]
     drawn = np.concatenate([np.column_stack([c.XY, c.U, c.V]) for c in quivers])
@@ -300,7 +282,7 @@ def test_means_against_x_are_weighted_means_of_the_stars(plot, converged):
     ax = plot.residuals(Figure().subplots(), kind="x", axis="v")
     (bars,) = [c for c in ax.containers if isinstance(c, ErrorbarContainer)]
     at, mean = bars.lines[0].get_data()
-    stars = converged.stars
+    stars = converged.diagnostics.sample
     shown = stars.probably_true
     x, residual = stars.table.x[shown], stars.residual[shown, 1]
     weight = 1.0 / stars.expected_square[shown].mean(axis=1)
@@ -312,8 +294,8 @@ def test_means_against_x_are_weighted_means_of_the_stars(plot, converged):
 
 
 def test_bars_of_a_budget_are_its_rows_with_the_total_last(converged):
-    ax = plots.plot_budget(converged.budget, Figure().subplots(), scale_mas=SCALE)
-    rows = converged.budget.rows()
+    ax = plots.plot_budget(converged.evaluation.budget, Figure().subplots(), scale_mas=SCALE)
+    rows = converged.evaluation.budget.rows()
     widths = [bar.get_width() for bar in ax.patches]
     np.testing.assert_allclose(widths, [SCALE * r["radial"] / np.sqrt(2) for r in rows], rtol=1e-12)
     assert "[mas]" in ax.get_xlabel()
@@ -326,26 +308,26 @@ def test_bars_of_a_budget_are_its_rows_with_the_total_last(converged):
 
 
 def test_margins_are_relative_to_their_limits(converged):
-    ax = plots.plot_margins(converged.margins, Figure().subplots())
+    ax = plots.plot_margins(converged.evaluation.margins, Figure().subplots())
     medians = [line for line in ax.lines if line.get_marker() not in ("None", None, "")]
-    for line, m in zip(medians, converged.margins, strict=True):
+    for line, m in zip(medians, converged.evaluation.margins, strict=True):
         assert line.get_xdata()[0] == pytest.approx(m.value / m.requirement.limit)
     words = [t.get_text() for t in ax.texts]
-    assert [w.partition(":")[0] for w in words] == [m.verdict for m in converged.margins]
+    assert [w.partition(":")[0] for w in words] == [m.verdict for m in converged.evaluation.margins]
 
 
 # -- chips ---------------------------------------------------------------------------------------
 
 
 def test_a_chip_is_chosen_by_its_number_and_named():
-    r = report_input(**WFC)
+    r = report_run(**WFC)
     plot = run_plots(r)
     assert plot.map(Figure().subplots(), chip=2).get_title().startswith("WFC1: posterior: ")
     assert plot.distortion(Figure().subplots()).get_title().startswith("WFC2: largest")
     ax = plot.budget(Figure().subplots(), chip=2)
     assert "WFC1" in ax.get_xlabel()
     widths = [bar.get_width() for bar in ax.patches]
-    alone = r.budget.chips[1].rows()
+    alone = r.evaluation.budget.chips[1].rows()
     np.testing.assert_allclose(widths, [row["radial"] / np.sqrt(2) for row in alone])
     names = [t.get_text() for t in plot.residuals(Figure().subplots(), kind="y").legend_.texts]
     assert names == ["WFC2", "WFC1"]
@@ -359,7 +341,7 @@ def test_a_chip_is_chosen_by_its_number_and_named():
         with pytest.raises(InputError, match="chip 3"):
             call(Figure().subplots(), chip=3)
     with pytest.raises(InputError, match="no chip 7; give one of 1, 2"):
-        plots.plot_budget(r.budget, Figure().subplots(), chip=7)
+        plots.plot_budget(r.evaluation.budget, Figure().subplots(), chip=7)
 
 
 # -- the corner plot -----------------------------------------------------------------------------
@@ -383,7 +365,7 @@ def test_by_default_a_corner_plot_is_that_of_the_report(converged, figures):
     reported = figures["outliers_corner"].axes
     ours = [panels[i, j] for i in range(3) for j in range(i + 1)]
     assert sorted(map(marks, ours)) == sorted(map(marks, reported))
-    report = report_input(outliers="none")
+    report = report_run(outliers="none")
     assert plots.plot_corner(report.posterior, fig=Figure()).shape == (1, 1)
 
 
@@ -451,7 +433,7 @@ def test_probabilities_over_time_are_those_of_the_report(converged):
     asked = Requirement("field-wide", "p95", 0.1, "pix", 0.95)
     period = ValidityPeriod(asked, years, p, p - 0.01, p + 0.01, np.ones_like(p))
     ax = run_plots(converged, validity=(period,)).validity(Figure().subplots())
-    r = replace(converged, validity=(period,))
+    r = converged.having(validity=(period,))
     assert marks(ax) == marks(figures_of(r, "validity_period")["validity_period"].axes[0])
     dates = [line.get_xdata()[0] for line in ax.lines if np.ptp(line.get_xdata()) == 0]
     assert dates == pytest.approx([2012.5])  # 0.95 = 1 - 0.02 (t - 2010)

@@ -19,13 +19,12 @@ from lxml import html as lxml_html
 from bayesdist.assess import Requirement, UserTerm
 from bayesdist.assess.budget_surface import budget_surface
 from bayesdist.assess.model import error_model
-from bayesdist.report.context import Product
 from bayesdist.report.overview import OverviewRow, write_overview
 from bayesdist.report.run_report import render_report, write_report
 from bayesdist.utils.checks import Check
 from tests.budgets import detector_budget
 
-from .runs import report_input
+from .runs import report_run, written
 
 # each ends what it may stand in, and says so if it runs
 HOSTILE = (
@@ -42,7 +41,7 @@ SCRIPT, COMMENT, QUOTE, STYLE, TITLE, TEMPLATE = HOSTILE
 @pytest.fixture(scope="module")
 def hostile():
     """A run whose chips, terms, requirements, exposures, files and settings have such names."""
-    run = report_input(size=(400.0, 200.0), names=(SCRIPT, COMMENT))
+    run = report_run(size=(400.0, 200.0), names=(SCRIPT, COMMENT))
     terms = tuple(UserTerm(name, "random", 0.003, 0.006, source=name) for name in HOSTILE)
     errors = error_model(run.solution, terms=terms, pixel_scale=2757.0)
     drawn = errors.drawn(200, np.random.default_rng(9))
@@ -56,22 +55,22 @@ def hostile():
         pixel_scale=2757.0,
     )
     named = Requirement(QUOTE, "p95", 1.0, unit="pix", probability=0.95)
-    names = (*HOSTILE[: len(run.stars.table.exposure_names)],)
+    names = (*HOSTILE[: len(run.diagnostics.sample.table.exposure_names)],)
     table = replace(
-        run.stars.table,
+        run.diagnostics.sample.table,
         sources=(STYLE,),
         exposure_names=names,
         rejected={COMMENT: 3, SCRIPT: 1},
     )
-    return replace(
-        run,
-        name=TITLE,
-        config={"data": {"matches": SCRIPT, COMMENT: QUOTE}, "detector": {"name": STYLE}},
-        stars=replace(run.stars, table=table),
+    return run.having(
+        title=TITLE,
+        configuration={"data": {"matches": SCRIPT, COMMENT: QUOTE}, "detector": {"name": STYLE}},
+        sample=replace(run.diagnostics.sample, table=table),
         budget=budget,
         surface=budget_surface(drawn, (5, 4), epoch=2010.3, years=(2009.5, 2012.5)),
-        margins=tuple(replace(m, requirement=named) for m in run.margins),
-        products=(Product(SCRIPT, COMMENT, (Check(QUOTE, STYLE, TITLE, TEMPLATE, "warn"),)),),
+        margins=tuple(replace(m, requirement=named) for m in run.evaluation.margins),
+        checks=(*run.evaluation.checks, Check(QUOTE, STYLE, TITLE, TEMPLATE, "warn")),
+        summary={"products": [written(SCRIPT, COMMENT, f"warning: {TITLE}")]},
         provenance={"command": SCRIPT, "inputs": {COMMENT: QUOTE}, "versions": {STYLE: TITLE}},
     )
 

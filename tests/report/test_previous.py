@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -48,7 +46,7 @@ def test_the_difference_is_what_was_added(converged, released):
     assert found.rms == pytest.approx(QUADRATIC * (4 / 45) ** 0.5, rel=0.02)
     assert found.similarity.shift[0] == pytest.approx(SHIFT + QUADRATIC / 3, rel=2e-3)
     assert found.differs
-    run = replace(converged, previous=(found,))
+    run = converged.having(previous=(found,))
     (row,) = previous_table(run).rows
     assert row[-1] == "differs"
     assert float(row[1].split("\u202f")[0]) == pytest.approx(found.rms, rel=5e-3)

@@ -9,45 +9,52 @@ from types import SimpleNamespace
 
 import pytest
 
+from bayesdist.app.artefacts.parts import StoredLookupTables
+from bayesdist.assess.evaluation import Evaluation
+from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.diagnose.holdout.validation import HoldoutValidation
 from bayesdist.infer import Posterior
+from bayesdist.kinds.campaign.report.data import CampaignData
 from bayesdist.missions.wise.bands.command import BANDS
 from bayesdist.missions.wise.bands.context import BandsInput
 from bayesdist.report.contents import Plot, Registry, Section
-from bayesdist.report.context import CampaignResults, ReportInput
 from bayesdist.report.page import parts_of
+from bayesdist.report.run import ReportedRun
 from bayesdist.report.run_report import STRIP, render_report
 from bayesdist.report.sections import REPORT
 from bayesdist.report.texttable import Level, TextTable
 
-from .campaigns import campaign_input
+from .campaigns import campaign_run
 from .plots import drawings_of
 
-RESULTS = {"report": ReportInput, "bands": BandsInput}
-PARTS = {"campaign": CampaignResults, "held_out": HoldoutValidation, "posterior": Posterior}
 DOCS = Path(__file__).resolve().parents[2] / "docs"
-
-
-def names_of(results: type) -> set[str]:
-    """Attributes of results, those of their parts behind a dot."""
-    own = {f.name for f in dataclasses.fields(results)}
-    parts = own & PARTS.keys()
-    return own | {f"{one}.{f.name}" for one in parts for f in dataclasses.fields(PARTS[one])}
+PARTS = {
+    "evaluation": Evaluation,
+    "diagnostics": Diagnostics,
+    "diagnostics.holdout": HoldoutValidation,
+    "posterior": Posterior,
+    "tables": StoredLookupTables,
+    "report_data": CampaignData,  # self-calibrations need none of theirs by name
+}
+NEEDED = {
+    "report": {name for name, member in vars(ReportedRun).items() if isinstance(member, property)}
+    | {f"{part}.{f.name}" for part, kind in PARTS.items() for f in dataclasses.fields(kind)},
+    "bands": {f.name for f in dataclasses.fields(BandsInput)},
+}
 
 
 @pytest.mark.parametrize("registry", [REPORT, BANDS], ids=lambda one: one.name)
 def test_entries_have_names_of_their_own_and_needs_that_exist(registry):
     figures = [one.name for one in registry.entries if one.kind == "figure"]
     assert len(figures) == len(set(figures))
-    known = names_of(RESULTS[registry.name])
     named = {section.name for section in registry.sections}
     for one in registry.entries:
-        assert set(one.needs) <= known, one.name
+        assert set(one.needs) <= NEEDED[registry.name], one.name
         assert one.section in named | {""} and one.make.__doc__, one.name
 
 
 def test_figures_and_words_stand_in_the_page(campaign_plots):
-    run, plots = campaign_input(), campaign_plots
+    run, plots = campaign_run(), campaign_plots
     for name, plot in plots.items():
         assert plot.title and plot.text and len(plot.alt) > 20, name
     drawings = drawings_of(plots)
@@ -62,7 +69,7 @@ def test_what_is_not_there_is_not_shown(converged):
     absent = {
         one.name
         for one in REPORT.entries
-        if {need.split(".")[0] for need in one.needs} & {"campaign", "selfcal", "held_out"}
+        if one.section.startswith(("campaign", "selfcal", "holdout"))
     }
     assert absent and not shown & absent
 

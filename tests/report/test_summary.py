@@ -57,8 +57,8 @@ def summary(converged):
         "One of three requirements is missed: worst corner.",
         ("Structure remains in the residuals.",),
         (("stars", "6 000"), ("exposures", "4"), ("sampler", "converged, R-hat 1.004")),
-        margin_rows(converged.margins),
-        budget_rows(converged.budget, scale_mas=2757.0),
+        margin_rows(converged.evaluation.margins),
+        budget_rows(converged.evaluation.budget, scale_mas=2757.0),
     )
 
 
@@ -114,12 +114,14 @@ def test_it_stays_short_however_large_the_run_is():
 
 
 def test_rows_have_the_numbers_of_the_margins_and_the_budget(converged):
-    for row, m in zip(margin_rows(converged.margins), converged.margins, strict=True):
+    for row, m in zip(
+        margin_rows(converged.evaluation.margins), converged.evaluation.margins, strict=True
+    ):
         assert float(row["Value"]) == pytest.approx(m.value, rel=0.05)
         assert row["Verdict"] == m.verdict and row["Requirement"] == m.requirement.name
         assert f"≤ {m.requirement.limit:g} pix" in row["Limit"]
-    rows = budget_rows(converged.budget, scale_mas=2757.0)
-    terms = converged.budget.rows()
+    rows = budget_rows(converged.evaluation.budget, scale_mas=2757.0)
+    terms = converged.evaluation.budget.rows()
     assert [row["Term"] for row in rows] == [term["name"] for term in terms]
     for row, term in zip(rows, terms, strict=True):
         per_axis = term["radial"] / np.sqrt(2)
@@ -127,7 +129,7 @@ def test_rows_have_the_numbers_of_the_margins_and_the_budget(converged):
         assert row["As an angle"].endswith("mas")
         angle = float(row["As an angle"].split("\u202f")[0].split()[0])
         assert angle == pytest.approx(2757.0 * per_axis, rel=6e-3)
-    assert "As an angle" not in budget_rows(converged.budget)[0]
+    assert "As an angle" not in budget_rows(converged.evaluation.budget)[0]
 
 
 def test_lines_of_text_fit_a_terminal_and_columns_stand_below_each_other(summary):

@@ -11,7 +11,7 @@ from bayesdist.infer.stars.stars import prepare
 from bayesdist.report.plots.trends import means_in_bins
 
 from .plots import plot_of
-from .runs import report_input
+from .runs import report_run
 
 
 def test_means_and_their_errors_are_the_weighted_ones():
@@ -47,9 +47,9 @@ def _errorbars(ax):
 
 def test_a_step_between_columns_is_seen_where_it_is(converged):
     """Columns from 508.5 on are shifted by 0.05 pixels in u, and in nothing else."""
-    stars = converged.stars
+    stars = converged.diagnostics.sample
     moved = stars.posterior_residual + np.where(stars.table.x[:, None] > 508.5, [0.05, 0.0], 0.0)
-    run = replace(converged, stars=replace(stars, posterior_residual=moved))
+    run = converged.having(sample=replace(stars, posterior_residual=moved))
     fig = plot_of(run, "residuals_by_column_and_row").figure
     steps = []
     for ax in fig.axes:  # u against x and y, v against x and y
@@ -63,7 +63,7 @@ def test_residuals_of_turned_exposures_are_along_the_detector(converged):
     """Frames that turn by nothing leave residuals as they are: two routes, one answer."""
     plots = plot_of(converged, "residuals_by_position")
     t, mean = _errorbars(plots.figure.axes[0])
-    stars = converged.stars
+    stars = converged.diagnostics.sample
     here = stars.probably_true
     weight = 1.0 / (stars.table.sigma_u[here] ** 2 + converged.posterior.likelihood.constants.j2[0])
     edges = np.linspace(0.5, 1016.5, len(t) + 1)
@@ -74,10 +74,10 @@ def test_residuals_of_turned_exposures_are_along_the_detector(converged):
 
 
 def test_chi_square_of_an_exposure_with_larger_errors_is_outside(converged):
-    stars = converged.stars
+    stars = converged.diagnostics.sample
     worse = stars.table.exposure == 2
     moved = np.where(worse[:, None], 1.5, 1.0) * stars.posterior_residual
-    run = replace(converged, stars=replace(stars, posterior_residual=moved))
+    run = converged.having(sample=replace(stars, posterior_residual=moved))
     plot = plot_of(run, "chi_square_by_exposure")
     ratio = plot.figure.axes[0].lines[-1].get_ydata()
     before = plot_of(converged, "chi_square_by_exposure").figure.axes[0].lines[-1].get_ydata()
@@ -87,24 +87,24 @@ def test_chi_square_of_an_exposure_with_larger_errors_is_outside(converged):
 
 def test_coverage_counts_the_stars_that_are_probably_true(converged):
     (image,) = plot_of(converged, "coverage").figure.axes[0].images
-    stars, _ = prepare(converged.fit.model, converged.stars.table)
+    stars, _ = prepare(converged.model, converged.diagnostics.sample.table)
     true = converged.posterior.likelihood.inliers(stars) > 0.5
-    assert image.get_array().sum() == true.sum() < len(converged.stars)
+    assert image.get_array().sum() == true.sum() < len(converged.diagnostics.sample)
 
 
 def test_pixel_scale_is_the_root_of_the_area():
-    run = report_input(unit="arcsec", scale=0.05)
+    run = report_run(unit="arcsec", scale=0.05)
     plot = plot_of(run, "pixel_scale")
-    area = run.chips[0].area
+    area = run.evaluation.areas[0]
     text = f"from {1e3 * np.sqrt(area.area.min() * area.reference_area):.6g} to"
     assert text in plot.text and "mas/pix" in plot.figure.axes[1].get_ylabel()
 
 
 def test_dates_of_one_night_are_in_days(converged):
-    stars = converged.stars
+    stars = converged.diagnostics.sample
     hours = np.array([0.0, 1.0, 2.0, 6.0])[stars.table.exposure % 4]
     night = stars.table.with_columns(epoch=2020.194906 + hours / 24 / 365.25)
-    plot = plot_of(replace(converged, stars=replace(stars, table=night)), "residuals_by_property")
+    plot = plot_of(converged.having(sample=replace(stars, table=night)), "residuals_by_property")
     axes = [ax for ax in plot.figure.axes if "epoch" in ax.get_xlabel()]
     assert len(axes) == 2
     for ax in axes:
