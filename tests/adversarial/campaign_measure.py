@@ -65,23 +65,23 @@ def assessed(truth: CampaignTruth, folder: Path, seed: int) -> Run:
     (folder / "config.toml").write_text(toml_text(configuration(truth, seed)))
     settings, text = load_config(folder / "config.toml")
     directory = RunDirectory.plan(folder / "run", settings, text, folder)
-    results = after_stages(directory, *STAGES)
+    run = after_stages(directory, *STAGES)
     # how the linear terms went with time takes longer than all the rest, and no error has it
     with patch("bayesdist.kinds.campaign.series.write_series_tables"):
-        return make_stages(results, ("diagnose", "evaluate"))
+        return make_stages(run, ("diagnose", "evaluate"))
 
 
-def actual_error(results: Run, truth: CampaignTruth) -> np.ndarray:
+def actual_error(run: Run, truth: CampaignTruth) -> np.ndarray:
     """Predicted less true positions (NEW, chips * ny * nx, 2) in exposures that are yet to come.
 
     Whoever uses the calibration there fits shift and rotation, with stars all over the chips.
     """
-    solution, epoch = results.solution, results.epoch
+    solution, epoch = run.solution, run.epoch
     assert epoch is not None
     mean = np.asarray(solution.mean)
     predicted, mosaic = [], []
     for chip in solution.model.chips:
-        x, y = mesh(*grid_pixels(chip.size, results.config.assess.grid))
+        x, y = mesh(*grid_pixels(chip.size, run.config.assess.grid))
         predicted.append(
             solution.model.predict(mean, x, y, chip=chip.number, epoch=np.full(x.size, epoch))
         )
@@ -99,14 +99,12 @@ def _aligned(predicted: np.ndarray, true: np.ndarray) -> np.ndarray:
     return a - b @ (left @ right)
 
 
-def coefficient_errors(
-    results: Run, truth: CampaignTruth
-) -> tuple[list[str], np.ndarray, np.ndarray]:
+def coefficient_errors(run: Run, truth: CampaignTruth) -> tuple[list[str], np.ndarray, np.ndarray]:
     """Names, errors (n,) and covariance (n, n) of the coefficients, in the gauge of the first chip.
 
     True are those of the least-squares polynomials through the true map and through its drift.
     """
-    bare = without_frames(results.solution)
+    bare = without_frames(run.solution)
     first = truth.chips[0].number
     view = reference_gauge(bare, first)
     true = view.transform(_true_coefficients(bare.model, truth))
@@ -137,19 +135,19 @@ def _true_coefficients(model: DistortionModel, truth: CampaignTruth) -> np.ndarr
     return theta
 
 
-def table_errors(results: Run, truth: CampaignTruth) -> np.ndarray:
+def table_errors(run: Run, truth: CampaignTruth) -> np.ndarray:
     """Of the look-up tables over the grid of the assessment (chips, N, 3, 2).
 
     Error, and its sigmas by the nodes alone and with what lies between them.  The best polynomial
     is taken off the error, as polynomials follow the tables.
     """
     out = []
-    local = {term.name: term for term in results.error_model.terms if isinstance(term, LocalErrors)}
-    for table in results.tables.tables:
+    local = {term.name: term for term in run.error_model.terms if isinstance(term, LocalErrors)}
+    for table in run.tables.tables:
         chip = next(one for one in truth.chips if one.number == table.chip)
         fine = mesh(*(np.arange(1.0, n, 3.0) for n in (chip.columns, chip.rows)))
-        grid = mesh(*grid_pixels((chip.columns, chip.rows), results.config.assess.grid))
-        basis = results.solution.model.basis(chip.number)
+        grid = mesh(*grid_pixels((chip.columns, chip.rows), run.config.assess.grid))
+        basis = run.solution.model.basis(chip.number)
 
         def left(x: np.ndarray, y: np.ndarray, table=table, chip=chip) -> np.ndarray:
             return table.evaluate(x, y) - truth.beside(*chip.mosaic(x, y))
@@ -157,19 +155,19 @@ def table_errors(results: Run, truth: CampaignTruth) -> np.ndarray:
         follows = np.linalg.lstsq(basis.evaluate(*fine), left(*fine))[0]
         error = left(*grid) - basis.evaluate(*grid) @ follows
         domain = EvaluationDomain.of_chips(
-            results.posterior.model,
-            results.config.assess.grid,
+            run.posterior.model,
+            run.config.assess.grid,
             chips=(chip.number,),
-            epoch=results.epoch,
+            epoch=run.epoch,
         )
         nodes, between = (local[name].sigma(domain) for name in ("look-up tables", BETWEEN))
         out.append(np.stack([error, nodes, np.hypot(nodes, between)], axis=1))
     return np.array(out)
 
 
-def stated_sigma(results: Run) -> np.ndarray:
+def stated_sigma(run: Run) -> np.ndarray:
     """Standard deviations (N, 2) of all terms of the budget together, over the same grid."""
-    errors, settings = results.error_model, results.evaluation_settings
-    rng = restarted(assessment_rng(results.config))
+    errors, settings = run.error_model, run.evaluation_settings
+    rng = restarted(assessment_rng(run.config))
     total = errors.at(settings.domain(errors), n=settings.draws, rng=rng).total
     return np.column_stack([total.u, total.v])

@@ -79,7 +79,7 @@ def assessed(truth: Truth, folder: Path, seed: int) -> Run:
 
 
 def actual_error(
-    results: Run, truth: Truth, rng: np.random.Generator, *, kindest: bool = False
+    run: Run, truth: Truth, rng: np.random.Generator, *, kindest: bool = False
 ) -> np.ndarray:
     """Predicted less true positions (chips * ny * nx, 2) over the grid of the assessment.
 
@@ -88,12 +88,12 @@ def actual_error(
     with the map that all exposures have in common, seen as that exposure points.  With `kindest`
     the best shift and rotation are taken off.
     """
-    model, mean = results.solution.model, np.asarray(results.solution.mean)
-    epoch, framed = results.epoch, model.frames != "none"
+    model, mean = run.solution.model, np.asarray(run.solution.mean)
+    epoch, framed = run.epoch, model.frames != "none"
     code = int(rng.integers(1, len(model.exposures))) if framed else 0
     predicted, true = [], []
     for chip in model.chips:
-        x, y = mesh(*grid_pixels(chip.size, results.config.assess.grid))
+        x, y = mesh(*grid_pixels(chip.size, run.config.assess.grid))
         when: dict[str, Any] = {"epoch": None if epoch is None else np.full(x.size, epoch)}
         if framed:
             when["exposure"] = np.full(x.size, code)
@@ -101,8 +101,8 @@ def actual_error(
         piece = next(one for one in truth.chips if one.number == chip.number)
         true.append(truth.true_map(*piece.mosaic(x, y), epoch))
     seen, at = np.concatenate(predicted), np.concatenate(true)
-    if "solved" in results.parts:
-        error = selfcal_error(results, truth, seen, code)
+    if "solved" in run.parts:
+        error = selfcal_error(run, truth, seen, code)
     elif framed:
         error = truth.frames[model.exposures[code]].undone(seen) - at
     else:
@@ -124,16 +124,16 @@ def without_motion(error: np.ndarray, at: np.ndarray) -> np.ndarray:
     return (both - taken).reshape(2, -1).T
 
 
-def stated_sigma(results: Run, *, kindest: bool = False) -> np.ndarray:
+def stated_sigma(run: Run, *, kindest: bool = False) -> np.ndarray:
     """Standard deviations (ny * nx, 2) of all terms of the budget together, over the same grid.
 
     With `kindest` they are those of an observer who fits shift and rotation, as the actual errors
     of `actual_error` then are.
     """
-    errors, settings = results.error_model, results.evaluation_settings
+    errors, settings = run.error_model, run.evaluation_settings
     if kindest:
         errors = replace(errors, aligned=True)
-    rng = restarted(assessment_rng(results.config))
+    rng = restarted(assessment_rng(run.config))
     total = errors.at(settings.domain(errors), n=settings.draws, rng=rng).total
     return np.column_stack([total.u, total.v])
 
@@ -146,7 +146,7 @@ def carried(truth: Truth | CampaignTruth, folder: Path, seed: int) -> Run:
 
 
 def compared(
-    results: Run,
+    run: Run,
     truth: Truth | CampaignTruth,
     rng: np.random.Generator,
     *,
@@ -158,10 +158,10 @@ def compared(
     always in campaigns.
     """
     if isinstance(truth, CampaignTruth):
-        error = campaign_measure.actual_error(results, truth)
-        return error, campaign_measure.stated_sigma(results), len(results.matches)
-    error = actual_error(results, truth, rng, kindest=kindest)[None]
-    return error, stated_sigma(results, kindest=kindest), truth.stars["x"].size
+        error = campaign_measure.actual_error(run, truth)
+        return error, campaign_measure.stated_sigma(run), len(run.matches)
+    error = actual_error(run, truth, rng, kindest=kindest)[None]
+    return error, stated_sigma(run, kindest=kindest), truth.stars["x"].size
 
 
 def attainable(margin: Margin, factor: float) -> float:
@@ -178,7 +178,7 @@ def attainable(margin: Margin, factor: float) -> float:
     return float(np.mean(at_or_under >= enough[0])) if enough else 0.0
 
 
-def judged(results: Run, error: np.ndarray) -> list[dict[str, Any]]:
+def judged(run: Run, error: np.ndarray) -> list[dict[str, Any]]:
     """Verdicts on requirements whose limits are a little under and over the actual error's."""
     requirements = tuple(
         Requirement(name, statistic, factor * float(field_statistic(statistic, error)))
@@ -194,7 +194,7 @@ def judged(results: Run, error: np.ndarray) -> list[dict[str, Any]]:
             "verdict": m.verdict,
             "reason": m.reason,
         }
-        for m, (_, _, factor) in zip(margins_of_run(results, requirements), ASKED, strict=True)
+        for m, (_, _, factor) in zip(margins_of_run(run, requirements), ASKED, strict=True)
     ]
 
 
@@ -212,12 +212,12 @@ def measured(name: str, seed: int, n: int | None = None) -> dict[str, Any]:
     one = KINDS[name]
     truth = one.truth(seed, n)
     began = time.perf_counter()
-    with TemporaryDirectory() as folder, closing(carried(truth, Path(folder), seed)) as results:
+    with TemporaryDirectory() as folder, closing(carried(truth, Path(folder), seed)) as run:
         rng = np.random.default_rng([7, seed])
-        error, stated, n_stars = compared(results, truth, rng, kindest=one.kindest)
-        margins = [margin for one in error[:JUDGED] for margin in judged(results, one)]
-        warnings = list(results.directory.summary["warnings"])
-        converged = bool(results.posterior.convergence.converged)
+        error, stated, n_stars = compared(run, truth, rng, kindest=one.kindest)
+        margins = [margin for one in error[:JUDGED] for margin in judged(run, one)]
+        warnings = list(run.directory.summary["warnings"])
+        converged = bool(run.posterior.convergence.converged)
     pull = np.abs(error) / stated
     return {
         "kind": name,

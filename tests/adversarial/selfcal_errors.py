@@ -21,12 +21,12 @@ def lists_of(truth: Truth) -> Table:
     return Table({name: truth.stars[name] for name in COLUMNS})
 
 
-def aligned(results: Run, truth: Truth) -> np.ndarray:
+def aligned(run: Run, truth: Truth) -> np.ndarray:
     """Shift, rotation and scale (4,) of the true sky by which held parameters have no errors.
 
     As z -> (p + i q) z + (r + i s), of the positions z = u + i v.
     """
-    solution, gauge = results.solution, results.parts["solved"].gauge
+    solution, gauge = run.solution, run.parts["solved"].gauge
     model, mean = solution.model, np.asarray(solution.mean)
     assert gauge.open.shape[1] == 4, "the exposures leave more free than a similarity"
     nodes, weights = legendre.leggauss(NODES)
@@ -51,14 +51,14 @@ def moved(uv: np.ndarray, by: np.ndarray) -> np.ndarray:
     return np.stack([p * u - q * v + r, q * u + p * v + s], axis=1)
 
 
-def selfcal_error(results: Run, truth: Truth, seen: np.ndarray, code: int) -> np.ndarray:
+def selfcal_error(run: Run, truth: Truth, seen: np.ndarray, code: int) -> np.ndarray:
     """Predicted less true positions (ny * nx, 2) over the grid, in the gauge of the run.
 
     Of positions `seen` in the exposure of that code, along the axes of the polynomials.
     """
-    solution = results.solution
+    solution = run.solution
     model, mean = solution.model, np.asarray(solution.mean)
-    x, y = mesh(*grid_pixels(model.chips[0].size, results.config.assess.grid))
+    x, y = mesh(*grid_pixels(model.chips[0].size, run.config.assess.grid))
     frame = truth.frames[model.exposures[code]]
-    true = moved(frame.seen(truth.true_map(x, y, None)), aligned(results, truth))
+    true = moved(frame.seen(truth.true_map(x, y, None)), aligned(run, truth))
     return np.linalg.solve(model.frame(mean, code)[0], (seen - true).T).T

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from dataclasses import replace
 from pathlib import Path
 
@@ -70,6 +71,18 @@ def test_python_and_the_command_line_agree_to_the_bit(run, finished):
     with bd.open_run(finished.path) as other:
         assert len(other.margins) == 3
         assert_same(run, other)
+
+
+def test_a_pickled_run_is_the_run(run, saved):
+    """In memory with its stars; in a folder without, where they are read again."""
+    assert_same(run, pickle.loads(pickle.dumps(run)))
+    with bd.open_run(saved) as opened:
+        assert_same(run, opened)
+        stars = opened.stars
+        with pickle.loads(pickle.dumps(opened)) as other:
+            assert "stars" not in other.made and "posterior" in other.made
+            assert_same(run, other)
+            np.testing.assert_array_equal(other.stars.x, stars.x)
 
 
 def test_a_saved_run_is_the_run(run, saved):

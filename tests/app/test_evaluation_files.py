@@ -19,14 +19,14 @@ from .support import summary_of
 
 
 @pytest.fixture(scope="module")
-def results(finished):
+def run(finished):
     with Run.of(RunDirectory.open(finished.path)) as opened:
         yield opened
 
 
-def test_what_is_read_is_what_would_be_made_again(results):
-    kept = load_evaluation(results.directory, results.fit, results.posterior)
-    made = evaluate(results).evaluation
+def test_what_is_read_is_what_would_be_made_again(run):
+    kept = load_evaluation(run.directory, run.fit, run.posterior)
+    made = evaluate(run).evaluation
     assert kept.budget.rows() == made.budget.rows()
     assert kept.checks == made.checks and kept.verdict == made.verdict
     for a, b in zip(kept.margins, made.margins, strict=True):
@@ -36,26 +36,26 @@ def test_what_is_read_is_what_would_be_made_again(results):
         np.testing.assert_array_equal(a.radius, b.radius)
 
 
-def test_the_verdict_is_the_worst_of_all(results):
-    kept = load_evaluation(results.directory, results.fit, results.posterior)
+def test_the_verdict_is_the_worst_of_all(run):
+    kept = load_evaluation(run.directory, run.fit, run.posterior)
     level, reasons = kept.verdict
     assert level == "fail"
     assert any(text.startswith("Too tight: missed") for text in reasons)
     assert replace(kept, margins=(), checks=()).verdict == ("pass", ())
 
 
-def test_diagnostics_are_those_of_the_summary(results):
-    found, summary = results.stored_diagnostics, summary_of(results.directory.path)
+def test_diagnostics_are_those_of_the_summary(run):
+    found, summary = run.stored_diagnostics, summary_of(run.directory.path)
     assert [one.name for one in found.score_tests] == [r["name"] for r in summary["score_tests"]]
     assert found.misfit.p_value == summary["misfit"]["p_value"]
-    assert found.sample.n_total == len(results.matches)
+    assert found.sample.n_total == len(run.matches)
 
 
-def test_they_belong_to_one_posterior(results):
-    other = replace(results.posterior, theta=results.posterior.theta + 1e-6)
-    assert load_diagnostics(results.directory, results.fit, other) is None
+def test_they_belong_to_one_posterior(run):
+    other = replace(run.posterior, theta=run.posterior.theta + 1e-6)
+    assert load_diagnostics(run.directory, run.fit, other) is None
     with pytest.raises(InputError, match="other data or settings"):
-        load_evaluation(results.directory, results.fit, other)
+        load_evaluation(run.directory, run.fit, other)
 
 
 @pytest.mark.parametrize(
@@ -65,12 +65,12 @@ def test_they_belong_to_one_posterior(results):
         [(200.0, 100.0), (800.0, 100.0), (800.0, 700.0), (200.0, 700.0)],
     ],
 )
-def test_maps_budget_and_requirements_are_of_the_field_of_the_detector(results, field):
+def test_maps_budget_and_requirements_are_of_the_field_of_the_detector(run, field):
     """The same errors as over the whole detector, at the positions that see the sky alone."""
-    detector = RunDetector(**results.config.detector.model_dump() | {"field": field})
-    config = results.config.model_copy(update={"detector": detector})
-    whole = load_evaluation(results.directory, results.fit, results.posterior)
-    made = evaluate(results.with_config(config)).evaluation
+    detector = RunDetector(**run.config.detector.model_dump() | {"field": field})
+    config = run.config.model_copy(update={"detector": detector})
+    whole = load_evaluation(run.directory, run.fit, run.posterior)
+    made = evaluate(run.with_config(config)).evaluation
     found, every = made.maps[0], whole.maps[0]
     X, Y = np.meshgrid(every.x, every.y)
     inside = (X > 200) & (X < 800) & (Y > 100) & (Y < 700)

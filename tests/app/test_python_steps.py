@@ -48,8 +48,8 @@ def both(request, tmp_path_factory):
     """A run and the steps of one truth."""
     folder = tmp_path_factory.mktemp("both")
     truth = KINDS[request.param].truth(0, STARS[request.param])
-    with closing(assessed(truth, folder, SEED - 1)) as results:
-        yield results, carried(truth, folder, SEED)
+    with closing(assessed(truth, folder, SEED - 1)) as run:
+        yield run, carried(truth, folder, SEED)
 
 
 def assert_same(one, other):
@@ -61,24 +61,24 @@ def assert_same(one, other):
 
 
 def test_diagnostics_are_those_of_a_run(both):
-    results, steps = both
-    np.testing.assert_array_equal(steps.posterior.theta, results.posterior.theta)
-    assert_same(steps.diagnostics, results.diagnostics)
+    run, steps = both
+    np.testing.assert_array_equal(steps.posterior.theta, run.posterior.theta)
+    assert_same(steps.diagnostics, run.diagnostics)
     again = diagnose(
         steps.posterior, steps.matches, fit=steps.fit, rng=np.random.default_rng([SEED, 2])
     )
-    assert_same(again, results.diagnostics)
+    assert_same(again, run.diagnostics)
 
 
 def test_budgets_are_those_of_a_run(both):
-    results, steps = both
-    assert steps.budget().rows() == results.evaluation.budget.rows()
+    run, steps = both
+    assert steps.budget().rows() == run.evaluation.budget.rows()
     assert steps.budget().notes == ()
 
 
 def test_verdicts_are_those_of_a_run(both):
-    results, steps = both
-    found, expected = steps.margins(NEEDS), margins_of_run(results, NEEDS)
+    run, steps = both
+    found, expected = steps.margins(NEEDS), margins_of_run(run, NEEDS)
     assert len({margin.verdict for margin in expected}) > 1
     for one, other in zip(found, expected, strict=True):
         assert_same(one, other)
@@ -126,8 +126,8 @@ def test_terms_quantities_and_magnitudes_are_those_of_a_run(tmp_path):
     options = {"seed": config.sampler.seed, "target_ess": 100, "target_rhat": 1.05}
     posterior = bd.sample(bd.fit_linear(matches, model), matches, **options)
     stages = ("fit", "sample", "diagnose", "evaluate")
-    with closing(after_stages(directory, *stages)) as results:
-        assert results.errors == QUOTED
+    with closing(after_stages(directory, *stages)) as run:
+        assert run.errors == QUOTED
         options = {
             "diagnostics": diagnose(posterior, matches),
             "catalogue": catalogue,
@@ -139,8 +139,8 @@ def test_terms_quantities_and_magnitudes_are_those_of_a_run(tmp_path):
         need = bd.Requirement("bright", "p95", 0.003 * u.arcsec, magnitude=14.0)
         assert (need.limit, need.unit) == (0.003, "arcsec")
         (margin,) = check_requirements(posterior, [need], **options)
-        (expected,) = results.evaluation.margins
-        assert error_budget(posterior, **options).rows() == results.evaluation.budget.rows()
+        (expected,) = run.evaluation.margins
+        assert error_budget(posterior, **options).rows() == run.evaluation.budget.rows()
         assert (margin.verdict, margin.reason) == (expected.verdict, expected.reason)
         assert margin.rests_on == expected.rests_on
         np.testing.assert_allclose(margin.draws, expected.draws / 1000, rtol=1e-12)

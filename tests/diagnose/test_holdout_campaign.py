@@ -105,7 +105,7 @@ def test_a_chip_that_is_displaced_is_named() -> None:
     assert found.tests[0].name == "deviation"
     assert found.verdict.startswith("the WFC1.shift u of exposure j004, held out whole, deviates")
     assert abs(found.tests[0].value) == pytest.approx(0.08, abs=0.03)
-    shown = SimpleNamespace(held_out=found)
+    shown = SimpleNamespace(diagnostics=SimpleNamespace(holdout=found))
     coverage, table = holdout_coverage(shown), holdout_table(shown)
     assert [row[:2] for row in coverage.rows] == [(a, f"{k} σ") for a in "uv" for k in (1, 2)]
     assert table.rows[0][0] == "deviation from other exposures"

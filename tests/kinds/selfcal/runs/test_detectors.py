@@ -44,12 +44,12 @@ def test_chips_lie_as_their_stars_say(tmp_path):
     config = write_selfcal(
         tmp_path / "input", list_table(truth), chip=blocks, detector=None, model={"order": 3}
     )
-    results = fitted(tmp_path / "run", config)
-    found = directions(results)
-    model, theta = results.fit.model, results.parts["solved"].mode.theta
+    run = fitted(tmp_path / "run", config)
+    found = directions(run)
+    model, theta = run.fit.model, run.parts["solved"].mode.theta
     rows = functionals(truth.model, truth.theta)
     # by how much the solution differs from the truth in what both chips say of each other
-    off = {name: rows[name] @ (_as_true(results, truth) - truth.theta) for name in rows}
+    off = {name: rows[name] @ (_as_true(run, truth) - truth.theta) for name in rows}
     for name in ("C2.shift_u", "C2.shift_v", "C2.rotation", "C2.scale"):
         assert found[name]["state"] == "known" and found[name]["fixed_by"] == "detections"
         assert abs(off[name]) < 4 * found[name]["sigma_detections"], name
@@ -59,12 +59,12 @@ def test_chips_lie_as_their_stars_say(tmp_path):
     assert np.hypot(*gap[0]) == pytest.approx(SIZE[1] + 50, rel=0.02)
 
 
-def _as_true(results, truth):
+def _as_true(run, truth):
     """The solution, moved along free directions to where the truth has what the gauge holds."""
     theta, null, held = (
-        results.parts["solved"].mode.theta,
-        results.parts["solved"].gauge.null,
-        results.parts["solved"].gauge.held,
+        run.parts["solved"].mode.theta,
+        run.parts["solved"].gauge.null,
+        run.parts["solved"].gauge.held,
     )
     first = theta - null @ np.linalg.solve(null[held], (theta - truth.theta)[held])
     for _ in range(3):  # of a large rotation the moves are not linear
@@ -95,9 +95,9 @@ def test_vafactor_is_applied(tmp_path):
         folder.mkdir()
         config = write_selfcal(folder / "input", lists, selfcal=block | {"exposures": "log.ecsv"})
         _log(truth, config.parent, factors if name == "with" else np.ones(8))
-        results = fitted(folder / "run", config)
-        sigma = np.sqrt(np.diag(results.parts["solved"].mode.cov))[at]
-        scales.append((results.parts["solved"].mode.theta[at], sigma))
+        run = fitted(folder / "run", config)
+        sigma = np.sqrt(np.diag(run.parts["solved"].mode.cov))[at]
+        scales.append((run.parts["solved"].mode.theta[at], sigma))
     (known, sigma), (unknown, _) = scales
     # the simulated sky is smaller on the detector where the frame's scale is larger: what the
     # frames have without VAFACTOR is VAFACTOR, and with it what is left is its square
@@ -133,12 +133,12 @@ def test_motions_of_stars_that_do_not_move(tmp_path):
         selfcal={"exposures": "log.ecsv", "motion": "proper_motion", "min_detections": 4},
     )
     _log(truth, config.parent, np.ones(8))
-    results = fitted(tmp_path / "run", config)
-    stars = star_catalogue(results.parts["solved"].mode)
+    run = fitted(tmp_path / "run", config)
+    stars = star_catalogue(run.parts["solved"].mode)
     assert stars.values.shape[1] == 4 and stars.epoch == pytest.approx(EPOCHS.mean())
-    assert results.parts["solved"].gauge.rates == ("drift_u", "drift_v", "spin")
-    assert not results.parts["solved"].gauge.unnamed
-    assert "motions are relative" in " ".join(results.parts["solved"].gauge.sentences)
+    assert run.parts["solved"].gauge.rates == ("drift_u", "drift_v", "spin")
+    assert not run.parts["solved"].gauge.unnamed
+    assert "motions are relative" in " ".join(run.parts["solved"].gauge.sentences)
     place, motion = (stars.values[:, k : k + 2] @ [1, 1j] for k in (0, 2))
     sigma = np.sqrt(np.einsum("naa->n", stars.own[:, 2:, 2:]) / 2)
     design = np.column_stack([np.ones(len(stars)), 1j * place]) / sigma[:, None]
@@ -150,7 +150,7 @@ def test_motions_of_stars_that_do_not_move(tmp_path):
     inside = np.mean(np.abs(pulls) < 2)
     # the distortion's errors come on top of the stars' own
     assert inside > 0.93 - 3 * np.sqrt(0.95 * 0.05 / len(pulls))
-    assert "pm_u" in Table.read(_stars(results)).colnames
+    assert "pm_u" in Table.read(_stars(run)).colnames
 
 
 def test_parallaxes(tmp_path):
@@ -180,12 +180,12 @@ def test_parallaxes(tmp_path):
     Table({"exposure": model.exposures, "epoch": epochs}).write(config.parent / "log.ecsv")
     known = rng.choice(len(truth.sky), 200, replace=False)
     _on_the_sky(truth.sky[known] - truth.sky.mean(axis=0)).write(config.parent / "reference.ecsv")
-    results = fitted(tmp_path / "run", config)
-    assert "parallax" in results.parts["solved"].gauge.rates
-    assert "parallax of the whole sky" in " ".join(results.parts["solved"].gauge.sentences)
+    run = fitted(tmp_path / "run", config)
+    assert "parallax" in run.parts["solved"].gauge.rates
+    assert "parallax of the whole sky" in " ".join(run.parts["solved"].gauge.sentences)
     problem, stars = (
-        results.parts["solved"].mode.problem,
-        star_catalogue(results.parts["solved"].mode),
+        run.parts["solved"].mode.problem,
+        star_catalogue(run.parts["solved"].mode),
     )
     whose = d.star[problem.rows[problem.starts[:-1]]]
     sigma = np.sqrt(stars.own[:, 4, 4])
@@ -196,7 +196,7 @@ def test_parallaxes(tmp_path):
     low, high = stats.chi2.ppf([1e-3, 1 - 1e-3], len(pulls) - 1)
     # the distortion's errors come on top of the stars' own
     assert low < (pulls**2).sum() < 1.15 * high
-    table = star_table(results.parts["solved"].mode, stars)
+    table = star_table(run.parts["solved"].mode, stars)
     assert table["parallax"].unit == "mas" and table["pm_u"].unit == "mas / yr"
 
 
@@ -215,10 +215,10 @@ def _on_the_sky(places: np.ndarray) -> Table:
     return Table(columns, units={"ra": "deg", "dec": "deg", "ra_error": "mas", "dec_error": "mas"})
 
 
-def _stars(results) -> Path:
-    path = results.directory / "stars.ecsv"
+def _stars(run) -> Path:
+    path = run.directory / "stars.ecsv"
     write_table(
-        star_table(results.parts["solved"].mode, star_catalogue(results.parts["solved"].mode)),
+        star_table(run.parts["solved"].mode, star_catalogue(run.parts["solved"].mode)),
         path,
     )
     return path
@@ -231,18 +231,18 @@ def test_a_start_from_an_earlier_run(three_rolls, tmp_path):
         list_table(three_rolls.truth),
         selfcal={"initial_distortion": str(three_rolls.path), "start_radius": 0.5},
     )
-    results = fitted(tmp_path / "run", config)
+    run = fitted(tmp_path / "run", config)
     before = load_fit(three_rolls.path / "fit.nc")
     # frames turn about another point: the polynomials are to be compared
     free = np.flatnonzero(before.sigma[: before.model.n_polynomial] > 0)
     # held coefficients are those of the start here, and of no distortion there
     moved = (
-        results.parts["solved"].gauge.null
+        run.parts["solved"].gauge.null
         @ np.linalg.lstsq(
-            results.parts["solved"].gauge.null[results.parts["solved"].gauge.held],
-            (before.mean - results.fit.mean)[results.parts["solved"].gauge.held],
+            run.parts["solved"].gauge.null[run.parts["solved"].gauge.held],
+            (before.mean - run.fit.mean)[run.parts["solved"].gauge.held],
             rcond=None,
         )[0]
     )
-    off = np.abs(results.fit.mean + moved - before.mean)
+    off = np.abs(run.fit.mean + moved - before.mean)
     assert (off[free] < 0.2 * before.sigma[free]).all()

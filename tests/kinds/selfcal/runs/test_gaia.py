@@ -30,7 +30,7 @@ ROBUST = 1.4826  # standard deviation over median absolute deviation of a normal
 
 @pytest.fixture(scope="module")
 def solved(data_dir, tmp_path_factory):
-    """The results of a fit, and the Gaia stars that it has not seen."""
+    """A fitted run, and the Gaia stars that it has not seen."""
     folder = tmp_path_factory.mktemp("flystar")
     for day, epoch in DAYS.items():
         path = data_dir / "flystar" / f"{day}_F606W_MATCHUP_XYMEEE_final.calib"
@@ -62,15 +62,15 @@ def solved(data_dir, tmp_path_factory):
         detector={"size": (2100, 2100), "scale_mas": 40.0},
         model={"order": 3},
     )
-    results = fitted(folder / "run", config)
+    run = fitted(folder / "run", config)
     others = read_catalog(folder / "others.ecsv")
     measured = (others.sigma_pm_u > 0) & (others.sigma_pm_v > 0)
-    return results, others.select(measured)
+    return run, others.select(measured)
 
 
 def test_gaia_fixes_what_the_detections_leave_open(solved):
-    results, _ = solved
-    gauge = summary_of(results.directory.path)["selfcal"]["gauge"]
+    run, _ = solved
+    gauge = summary_of(run.directory.path)["selfcal"]["gauge"]
     free = [one for one in gauge["directions"] if one["state"] == "free"]
     assert {one["name"] for one in free} >= {"zero_point_u", "zero_point_v", "scale", "rotation"}
     assert {one["fixed_by"] for one in free} == {"reference stars"}
@@ -83,13 +83,13 @@ def test_other_gaia_stars_move_as_was_found(solved, capsys):
     Gaia's errors of faint stars are too small where stars are crowded, and a cubic leaves 0.03
     pixels of what the observatory's solution has left: places differ by more than their errors.
     """
-    results, others = solved
-    stars = star_catalogue(results.parts["solved"].mode)
+    run, others = solved
+    stars = star_catalogue(run.parts["solved"].mode)
     there: ReferenceCatalog = others.at(stars.epoch)
     tree = cKDTree(stars.values[:, :2])
     distance, which = tree.query(np.column_stack([there.u, there.v]), distance_upper_bound=0.08)
     pairs = np.flatnonzero(np.isfinite(distance))
-    pairs = pairs[~results.parts["solved"].mode.problem.priors.informed[which[pairs]]]
+    pairs = pairs[~run.parts["solved"].mode.problem.priors.informed[which[pairs]]]
     which = which[pairs]
     found = {}
     for name, first in (("place", 0), ("motion", 2)):
