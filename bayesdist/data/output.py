@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping
 from html import escape
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,17 +46,32 @@ def table_of(matches: MatchColumns) -> QTable:
     return table
 
 
-def geometry_header(matches: MatchColumns) -> dict[str, Any]:
+class GeometryHeader(TypedDict, total=False):
+    """Geometry of matches in the header of a table."""
+
+    tangent_point: list[float]  # right ascension and declination, degrees
+    match_radius: float
+    unit: str  # of the match radius
+
+
+class Geometry(TypedDict, total=False):
+    """Arguments of `Matches` from a `GeometryHeader`."""
+
+    tangent_point: tuple[float, float]  # right ascension and declination, degrees
+    match_radius: float  # in the unit of u and v
+
+
+def geometry_header(matches: MatchColumns) -> GeometryHeader:
     """Tangent point and match radius (with its unit) of matches, if they have them."""
-    header: dict[str, Any] = {}
+    header: GeometryHeader = {}
     if matches.tangent_point is not None:
         header["tangent_point"] = list(matches.tangent_point)
     if matches.match_radius is not None:
-        header |= {"match_radius": matches.match_radius, "unit": matches.unit}
+        header["match_radius"], header["unit"] = matches.match_radius, matches.unit
     return header
 
 
-def header_arguments(header: Mapping[str, Any], unit: str, *, source: str) -> dict[str, Any]:
+def header_arguments(header: Mapping[str, Any], unit: str, *, source: str) -> Geometry:
     """Arguments of `Matches` from the header of a table that has a `geometry_header`.
 
     `unit` is that of u and v, to which the match radius is converted.  The result is empty for a
@@ -65,7 +80,7 @@ def header_arguments(header: Mapping[str, Any], unit: str, *, source: str) -> di
     stated = header.get(HEADER)
     if not isinstance(stated, Mapping):
         return {}
-    out: dict[str, Any] = {}
+    out: Geometry = {}
     point, radius = stated.get("tangent_point"), stated.get("match_radius")
     if isinstance(point, list | tuple) and len(point) == 2:
         out["tangent_point"] = (float(point[0]), float(point[1]))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import TypedDict
 
 import numpy as np
 from astropy.table import Table
@@ -174,7 +174,49 @@ def refuse_unconnected(table: Table) -> None:
     )
 
 
-def matching_facts(found: SelfCalibration, inputs: Inputs) -> dict[str, Any]:
+class TangentPlaneFacts(TypedDict):
+    """Tangent points of exposures and stars."""
+
+    chip: int  # number of the chip with the tangent points of the exposures
+    pixel: list[float]  # tangent point of each exposure: (x, y), FITS 1-based
+    contact: list[float]  # tangent point of the stars (u, v)
+    unit: str  # of the contact
+
+
+class DetectionCounts(TypedDict):
+    """Numbers of detections; `cut` and `unused` are by reason."""
+
+    read: int
+    cut: dict[str, int]
+    used: int
+    unused: dict[str, int]
+
+
+class PerStar(TypedDict):
+    """Number of detections of a star."""
+
+    median: float
+    most: int
+
+
+class MatchingFacts(TypedDict):
+    """Section 'selfcal' of summary.json, as the stage 'match' writes it."""
+
+    n_exposures: int
+    n_stars: int
+    n_ambiguous: int
+    n_doubled: int
+    n_chains: int
+    iterations: int
+    match_radius: float  # pixels
+    tangent_plane: TangentPlaneFacts | None  # None if the sky is flat
+    tangent_planes_pix: float  # largest displacement onto the common tangent plane
+    detections: DetectionCounts
+    per_star: PerStar
+    warnings: list[str]
+
+
+def matching_facts(found: SelfCalibration, inputs: Inputs) -> MatchingFacts:
     """Section 'selfcal' of summary.json: numbers of detections and stars."""
     d, friends, p = found.detections, found.friends, found.mode.problem
     raw = inputs.detections  # before they were moved onto a common tangent plane
@@ -213,7 +255,7 @@ def matching_facts(found: SelfCalibration, inputs: Inputs) -> dict[str, Any]:
     }
 
 
-def tangent_plane_facts(found: SelfCalibration, inputs: Inputs) -> dict[str, Any] | None:
+def tangent_plane_facts(found: SelfCalibration, inputs: Inputs) -> TangentPlaneFacts | None:
     """Tangent points of exposures and stars, for summary.json; None if the sky is flat."""
     model = found.mode.problem.model
     contact = inputs.contact(model, found.mode.theta)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from itertools import combinations
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 from astropy.table import Column, Table
@@ -31,13 +31,26 @@ MIN_MEMBERS = 2 / 3  # expected fraction of true detections below which a star i
 PARQUET_FROM = 100_000  # number of stars above which a Parquet file is written, too
 
 
+class StarsFacts(TypedDict):
+    """Entry 'stars' of the section 'selfcal' of summary.json."""
+
+    n: int
+    unit: str  # of the radii
+    epoch: float | None  # decimal years; None if stars do not move
+    n_two_detections: int
+    n_doubtful: int
+    n_reference: int
+    radius_median: float  # errors of both axes together, including those of the distortion
+    radius_own_median: float  # from the detections of the star alone
+
+
 def write_stars(
     folder: Path,
     solved: SelfCalibrated,
     correlated: Discrepancy | None,
     notes: Mapping[str, Any],
     compute: Compute,
-) -> dict[str, Any]:
+) -> StarsFacts:
     """Write stars.ecsv and, if there are many stars, stars.parquet.
 
     Parameters
@@ -52,8 +65,7 @@ def write_stars(
 
     Returns
     -------
-    dict
-        Entry for summary.json.
+    StarsFacts
     """
     solution, references = solved.mode, solved.references
     cov = None if correlated is None else correlated.covariance
