@@ -13,7 +13,7 @@ from functools import cache
 from typing import TYPE_CHECKING
 
 from bayesdist.calibration.calibration import Calibration
-from bayesdist.errors import InputError, required
+from bayesdist.errors import FormatError, InputError, required
 from bayesdist.files.atomic import refuse_unsafe_name
 from bayesdist.files.fits import refuse_cut_records
 from bayesdist.plugin import objects
@@ -77,6 +77,13 @@ def recognized(content: Content) -> Document:
     with readable(content.name):
         if content.is_fits and all(hdu.state == "whole" for hdu in content.hdus):
             refuse_cut_records(content.raw, content.budget)
+        for hdu in content.hdus:
+            if not isinstance(hdu.header.get("EXTNAME", ""), str):
+                raise FormatError(
+                    f"the name of HDU {hdu.number} (EXTNAME) is no text",
+                    where=content.name,
+                    do="correct the card, or write the file again",
+                )
     for format_ in all_formats():
         with readable(content.name):
             holds = format_.parse(content)

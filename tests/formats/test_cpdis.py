@@ -292,3 +292,18 @@ def test_commands_take_the_tables(tmp_path):
     (tmp_path / "stars.csv").write_text("x,y\n31,9\n150,200\n")
     good("apply", path, tmp_path / "stars.csv", "-o", tmp_path / "out.csv")
     assert "approximated by a polynomial" in good("compare", path, path).out
+
+
+def test_errors_of_one_axis_alone_and_names_that_are_no_text(tmp_path):
+    path = write(tmp_path, on_sky(2))
+    with fits.open(path) as hdus:
+        del hdus["WCSDVERR", 2]
+        hdus.writeto(tmp_path / "one.fits")
+    [finding] = [f for f in registry.lint(tmp_path / "one.fits") if f.where == "WCSDVERR,2"]
+    assert finding.level == "warning" and "is missing" in finding.message
+    raw = path.read_bytes()
+    card = b"EXTNAME = 'WCSDVERR'"
+    assert raw.count(card) == 2
+    (tmp_path / "number.fits").write_bytes(raw.replace(card, b"EXTNAME = ".ljust(17) + b"606", 1))
+    with pytest.raises(FormatError, match=r"the name of HDU \d \(EXTNAME\) is no text"):
+        registry.read_calibration(tmp_path / "number.fits")

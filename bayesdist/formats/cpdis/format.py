@@ -294,6 +294,11 @@ def _tables(image: CpdisImage) -> Iterator[Finding]:
         else:
             yield from _registration(image, plane, location)
         sigma = image.tables.get((ERRORS, image.version(axis)))
+        if sigma is None and any((ERRORS, image.version(k)) in image.tables for k in (1, 2)):
+            yield Finding(
+                "warning", f"{ERRORS},{image.version(axis)}",
+                "is missing, and the errors of the other axis are there",
+            )  # fmt: skip
         if sigma is not None and (
             sigma.image.shape != values.shape or not (sigma.image >= 0).all()
         ):
