@@ -71,9 +71,10 @@ def _refuse_unfounded(raw: bytes, budget: Budget) -> None:
 def refuse_cut_records(raw: bytes, budget: Budget) -> None:
     """Raise FormatError if a file is not a multiple of records long (FITS 4.0, section 3.1).
 
-    Its HDUs may be complete, and further ones missing.
+    Its HDUs may be complete, and further ones missing.  A remainder of blanks is accepted: it is
+    no part of an HDU.
     """
-    if len(raw) % RECORD:
+    if raw[len(raw) // RECORD * RECORD :].strip(b" "):
         raise FormatError(
             f"has {len(raw)} bytes, which are not whole records of {RECORD}, so that further HDUs "
             "may be missing",
