@@ -174,6 +174,15 @@ def test_epochs_that_are_none():
         read(t)
 
 
+def test_epochs_in_columns_of_objects():
+    years = [2016.0, "2016.0", 2016, "2016-01-01T12:00:00", 2016.0, 2016.0]
+    read_years = read(stars(epoch=np.array(years, object))).epoch
+    assert read_years == pytest.approx(2016.0, abs=2e-3)
+    structures = np.array([{"a": 1.0}] * 6, object)
+    with pytest.raises(InputError, match="row 1, column 'epoch': .* is no date"):
+        read(stars(epoch=structures))
+
+
 def test_labels_of_every_type():
     for labels in (
         [7, 7, 3, 3, 7, 9],

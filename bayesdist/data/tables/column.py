@@ -336,8 +336,8 @@ def _text(value: Any) -> str:
 
 def _all_numbers(texts: Iterable[Any]) -> bool:
     try:
-        for text in texts:
-            number_of(text)
+        for text in texts:  # Parquet has lists, structures and objects of several types
+            number_of(_text(text))
     except (ValueError, TypeError):
         return False
     return True
