@@ -179,7 +179,7 @@ def test_epochs_in_columns_of_objects():
     read_years = read(stars(epoch=np.array(years, object))).epoch
     assert read_years == pytest.approx(2016.0, abs=2e-3)
     structures = np.array([{"a": 1.0}] * 6, object)
-    with pytest.raises(InputError, match="row 1, column 'epoch': .* is no date"):
+    with pytest.raises(InputError, match=r"row 1, column 'epoch': .* is no date"):
         read(stars(epoch=structures))
 
 
