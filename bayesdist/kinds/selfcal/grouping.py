@@ -262,10 +262,20 @@ def cells(places: Float, exposure: Int, length: float, detections: int) -> Itera
 
 
 def _squares(places: Float, length: float) -> Int:
-    """Grid squares (2, N), counted from the lowest one; the grid is common to all cells."""
+    """Grid squares (2, N), counted from the lowest one; the grid is common to all cells.
+
+    Raises InputError if a place is so far from the others that the grid has too many squares.
+    """
     lowest, highest = (np.floor(end / (length / FINE)) for end in (places.min(0), places.max(0)))
-    narrow = (highest - lowest).max() < np.iinfo(np.int32).max
-    square = np.empty((2, len(places)), np.int32 if narrow else np.int64)
+    if (highest - lowest).max() > np.iinfo(np.int32).max:
+        far = int(np.argmax(np.abs(places - np.median(places, axis=0)).max(axis=1)))
+        raise InputError(
+            f"detection {far + 1} of all lists is too far from the others to be matched: "
+            f"{np.abs(places[far]).max():.3g} from the zero point; the match length is {length:.3g}",
+            where="selfcal.lists",
+            do="correct x and y of the lists, or the initial distortion",
+        )
+    square = np.empty((2, len(places)), np.int32)
     for axis in range(2):
         square[axis] = np.floor(places[:, axis] / (length / FINE)) - lowest[axis]
     return square
