@@ -400,8 +400,9 @@ def head_of(facts: Mapping[str, Any]) -> dict[str, Any]:
     """Entries of summary.json about the run as a whole."""
     config = facts["config"]
     kind = next(name for name in installed_kinds() if name in config)
-    chips = " and ".join(chip["name"] for chip in config["chip"])
-    parts = [config["detector"]["name"] or chips, config[kind].get("filter")]
+    # a damaged run.json may lack names, which are for display only
+    chips = " and ".join(chip.get("name", "") for chip in config.get("chip", ()))
+    parts = [config.get("detector", {}).get("name") or chips, config[kind].get("filter")]
     return {
         "bayesdist": facts["versions"]["bayesdist"],
         "kind": kind,

@@ -17,8 +17,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
@@ -271,11 +273,11 @@ def _squares(places: Float, length: float) -> Int:
         far = int(np.argmax(np.abs(places - np.median(places, axis=0)).max(axis=1)))
         raise InputError(
             f"detection {far + 1} of all lists is too far from the others to be matched: "
-            f"{np.abs(places[far]).max():.3g} from the zero point; the match length is {length:.3g}",
+            f"{np.abs(places[far]).max():.3g} from the zero point, with match length {length:.3g}",
             where="selfcal.lists",
             do="correct x and y of the lists, or the initial distortion",
         )
-    square = np.empty((2, len(places)), np.int32)
+    square: NDArray[Any] = np.empty((2, len(places)), np.int32)  # half of the memory of int64
     for axis in range(2):
         square[axis] = np.floor(places[:, axis] / (length / FINE)) - lowest[axis]
     return square
