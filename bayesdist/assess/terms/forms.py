@@ -485,34 +485,29 @@ class FunctionField(DrawnField):
         return super().total()
 
     def _stated(self, covariance: Mapping[int | None, Float]) -> Float:
-        at, functions = self.domain, self.of.functions
-        phi = {
-            chip: np.asarray(functions(chip, at.x[rows], at.y[rows]), float)
-            for chip, rows in at.by_chip()
-        }
-
-        def squares(values: Float, chip: int) -> Float:
-            chip_covariance = covariance[chip if chip in covariance else None]
-            return np.asarray(np.einsum("nk,akl,nl->na", values, chip_covariance, values))
-
-        pairs = at.pairs()
+        """Mean squares (P, 2) from the covariance of the coefficients."""
+        at, pairs = self.domain, self.domain.pairs()
+        # along u and v: functions (2, N, m) whose coefficients are independent, of unit variance
+        functions = np.concatenate(
+            [
+                np.asarray(self.of.functions(chip, at.x[rows], at.y[rows]), float)
+                @ _roots(covariance[chip if chip in covariance else None])
+                for chip, rows in at.by_chip()
+            ],
+            axis=1,
+        )
+        squares = np.square(functions).sum(axis=2).T
         if pairs is None:
-            return np.concatenate([squares(values, chip) for chip, values in phi.items()])
-        all_values, out = np.concatenate(list(phi.values())), np.empty((pairs.shape[1], 2))
-        first, second = at.chip[pairs]
-        for chip in phi:
-            rows = first == chip
-            same_chip = rows & ((second == chip) | (None in covariance))
-            out[same_chip] = squares(
-                all_values[pairs[1, same_chip]] - all_values[pairs[0, same_chip]], chip
-            )
-        apart = (first != second) & (None not in covariance)
-        for side, chips in ((0, first), (1, second)):
-            for chip in phi:
-                rows = apart & (chips == chip)
-                part = squares(all_values[pairs[side, rows]], chip)
-                out[rows] = part if side == 0 else out[rows] + part
-        return out
+            return np.asarray(squares)
+        first, second = pairs
+        out = squares[first] + squares[second]  # of chips whose coefficients are independent
+        common = np.flatnonzero((at.chip[first] == at.chip[second]) | (None in covariance))
+        step = max(1, BLOCK // functions.shape[2])
+        for start in range(0, len(common), step):
+            rows = common[start : start + step]
+            differences = functions[:, second[rows]] - functions[:, first[rows]]
+            out[rows] = np.square(differences).sum(axis=2).T
+        return np.asarray(out)
 
     def relative_error(self, chip: int, monte_carlo: float) -> float | None:
         """Relative scatter of the rms of each draw over the chip; None if the size is stated."""
@@ -524,6 +519,12 @@ class FunctionField(DrawnField):
         by_draw = np.sqrt(np.mean(np.square(values, dtype=float), axis=(1, 2)))
         mean = float(by_draw.mean())
         return float(by_draw.std()) / mean if mean > 0 else 0.0
+
+
+def _roots(covariance: Float) -> Float:
+    """Matrices R (2, m, m) with R R^T equal to the covariances (2, m, m), which may be singular."""
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0))[:, None])
 
 
 def _of_draws(values: NDArray[np.floating], draws: slice) -> NDArray[np.floating]:
