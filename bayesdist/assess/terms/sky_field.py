@@ -1,0 +1,182 @@
+"""Fields of errors on the sky with a known angular covariance, as seen on a detector."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.linalg import cho_factor, cho_solve
+from scipy.spatial.distance import cdist
+
+from bayesdist.assess.domain import EvaluationDomain
+from bayesdist.assess.solution import place_of
+from bayesdist.assess.terms.forms import FunctionField, Functions, Image, Pool, Row
+from bayesdist.assess.terms.given import SMOOTH_DRAWS
+from bayesdist.model import DistortionModel
+from bayesdist.model.grid import grid_pixels, mesh
+from bayesdist.utils.arrays import Float
+
+NODES = 12  # along u and v of the field, between which the field of errors is interpolated
+MODES = 40  # functions that represent the field beyond its constant and tilt
+WAVES = 12  # waves, each a sine and a cosine, that represent its structure finer than these
+GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))  # directions of waves that are spread evenly
+
+
+@dataclass(frozen=True)
+class AngularCovariance:
+    """Covariance of errors at two directions as a function of their separation.
+
+    It is a sum of exponentials, V(theta) = sum of v exp(-theta / s), for each of the axes u and v,
+    which are independent.
+    """
+
+    # variance v in mas^2 (per year^2 for motions) and scale s in degrees of each exponential
+    parts: tuple[tuple[float, float], ...] = ()
+
+    def __call__(self, separation: ArrayLike) -> Float:
+        """Covariance in mas^2 at separations in degrees, of any shape."""
+        theta = np.asarray(separation, float)
+        out = np.zeros(theta.shape)
+        for variance, scale in self.parts:
+            out += variance * np.exp(-theta / scale)
+        return out
+
+    def __add__(self, other: AngularCovariance) -> AngularCovariance:
+        return AngularCovariance((*self.parts, *other.parts))
+
+    def times(self, factor: float) -> AngularCovariance:
+        """Covariance multiplied by a factor."""
+        return AngularCovariance(tuple((factor * v, scale) for v, scale in self.parts))
+
+    @property
+    def sigma(self) -> float:
+        """Standard deviation of one error on one axis, in mas."""
+        return math.sqrt(sum(variance for variance, _ in self.parts))
+
+
+class SplitField:
+    """Gaussian field of errors on one axis, split into a constant and tilt, and the rest.
+
+    The constant and tilt are the generalised least-squares estimate from the errors at nodes that
+    cover the field, so that they are independent of the rest.  The rest is represented by the
+    functions with the largest variance, and by waves for structure finer than these.  The sum has
+    the stated variance everywhere.
+    """
+
+    def __init__(
+        self, covariance: AngularCovariance, model: DistortionModel, mean: Float, mas: float
+    ) -> None:
+        """Prepare the functions; `mas` is one mas in the unit of u and v."""
+        self.covariance, self.model, self._mean, self._mas = covariance, model, mean, mas
+        edges = [self._sky(c.number, *mesh(*grid_pixels(c.size, (5, 5)))) for c in model.chips]
+        low, high = (f(np.concatenate(edges), axis=0) for f in (np.min, np.max))
+        self._centre, self._half = (low + high) / 2.0, np.maximum((high - low) / 2.0, 1e-12)
+        side = np.linspace(-1.0, 1.0, NODES)
+        unit_nodes = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
+        self._nodes = self._centre + self._half * unit_nodes
+        K = mas**2 * covariance(cdist(self._nodes, self._nodes))
+        self._factor = cho_factor(K)
+        B = self._plane(self._nodes)
+        S = np.linalg.inv(B.T @ cho_solve(self._factor, B))
+        self._tilt = np.linalg.cholesky((S + S.T) / 2.0)
+        root = B @ self._tilt
+        values, vectors = np.linalg.eigh(K - root @ root.T)
+        largest = np.argsort(values)[::-1][:MODES]
+        self._modes = cho_solve(
+            self._factor, vectors[:, largest] * np.sqrt(np.maximum(values[largest], 0.0))
+        )
+        # the spectrum of exp(-theta / s) falls as k^-3 in the plane, so that 1 / k is uniform
+        index = np.arange(WAVES)
+        k = np.pi * math.sqrt(MODES) / (2.0 * self._half.mean()) / ((index + 0.5) / WAVES)
+        angle = GOLDEN_ANGLE * index
+        self._waves = k * np.stack([np.cos(angle), np.sin(angle)])
+
+    def _sky(self, chip: int, x: Float, y: Float) -> Float:
+        """Positions (N, 2) on the sky in degrees, of pixels (N,) on a chip."""
+        epoch = None if self.model.time is None else self.model.time.epoch0[0]
+        place = place_of(self.model, epoch=epoch, chip=chip)
+        uv = place.basis.evaluate(x, y) @ place.polynomial(self._mean).T
+        return np.asarray(uv / (3.6e6 * self._mas))
+
+    def _plane(self, sky: Float) -> Float:
+        """Constant and tilts (N, 3) at positions (N, 2)."""
+        return np.column_stack([np.ones(len(sky)), (sky - self._centre) / self._half])
+
+    def tilt(self, chip: int, x: Float, y: Float) -> Float:
+        """Values (N, 3) of functions whose coefficients have unit variance: constant and tilt."""
+        return np.asarray(self._plane(self._sky(chip, x, y)) @ self._tilt)
+
+    def rest(self, chip: int, x: Float, y: Float) -> Float:
+        """Values (N, m) of functions whose coefficients have unit variance: the rest."""
+        sky = self._sky(chip, x, y)
+        phi = self._mas**2 * self.covariance(cdist(sky, self._nodes)) @ self._modes
+        common = np.square(self._plane(sky) @ self._tilt).sum(axis=1)
+        variance = np.maximum((self._mas * self.covariance.sigma) ** 2 - common, 0.0)
+        size = np.square(phi).sum(axis=1)
+        # rounding may leave more in the functions than there is
+        phi *= np.sqrt(np.minimum(variance / np.where(size > 0, size, 1.0), 1.0))[:, None]
+        fine = np.sqrt(np.maximum(variance - size, 0.0) / WAVES)[:, None]
+        phase = sky @ self._waves
+        return np.hstack([phi, fine * np.cos(phase), fine * np.sin(phase)])
+
+
+@dataclass(frozen=True, eq=False)
+class SkyTerm:
+    """One part of a catalogue's field of errors."""
+
+    row: Row
+    split: SplitField
+    is_tilt: bool  # True for the constant and tilt, False for the rest
+    epoch: float | None = None  # epoch of the catalogue, for errors of motions; None for positions
+    date: float | None = None  # of the exposures; None for the date of the evaluation
+
+    @property
+    def rows(self) -> tuple[Row, ...]:
+        """Row of the part."""
+        return (self.row,)
+
+    def draw(self, n: int, rng: np.random.Generator) -> Functions | GrowingFunctions:
+        """Draws of independent coefficients for u and v."""
+        functions = self.split.tilt if self.is_tilt else self.split.rest
+        n_own, m = min(n, SMOOTH_DRAWS), 3 if self.is_tilt else MODES + 2 * WAVES
+        out = Functions(
+            self.row,
+            {None: rng.standard_normal((n_own, 2, m))},
+            functions,
+            n,
+            covariance={None: np.tile(np.eye(m), (2, 1, 1))},
+            pools=(Pool(np.arange(n) % n_own, n_own, renewed=True),),
+        )
+        return out if self.epoch is None else GrowingFunctions(out, self.epoch, self.date)
+
+
+@dataclass(frozen=True, eq=False)
+class GrowingFunctions:
+    """Errors proportional to the time since the epoch of a catalogue."""
+
+    per_year: Functions
+    epoch: float  # decimal years
+    date: float | None  # see `SkyTerm`
+    _cache: dict[float, Functions] = field(default_factory=dict, repr=False)
+
+    @property
+    def pools(self) -> tuple[Pool, ...]:
+        """Finite sets from which the coefficients are taken."""
+        return self.per_year.pools
+
+    def on(self, domain: EvaluationDomain, image: Image) -> FunctionField:
+        """Errors at the positions and the epoch of a domain."""
+        date = domain.epoch if self.date is None else self.date
+        years = 0.0 if date is None else date - self.epoch
+        if years not in self._cache:
+            self._cache.clear()  # as in `Functions.on`
+            of = self.per_year
+            self._cache[years] = replace(
+                of,
+                coefficients={k: years * c for k, c in of.coefficients.items()},
+                covariance={k: years**2 * c for k, c in (of.covariance or {}).items()},
+                _cache={},
+            )
+        return self._cache[years].on(domain, image)
