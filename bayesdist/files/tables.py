@@ -133,14 +133,14 @@ def _read_separated(path: Path, limits: Limits, *, mark: str) -> Table:
     if detected_mark is None and is_text_table(lines):
         return _read_text(path, limits)
     mark = detected_mark or mark
-    lines = _whole_lines(without_empty_names(lines, mark), mark, path)
+    whole = _whole_lines(without_empty_names(lines, mark), mark, path)
     cells = next(csv.reader([names], delimiter=mark), [])
     Budget.of_file(path, limits).refuse_columns(len(cells))
     refuse_numbers_as_names(cells, where=str(path))
     # the time astropy needs for a comment grows with the square of its length
-    lines = with_decimal_points([line for line in lines if line[:1] != "#"], mark, where=str(path))
+    lines = with_decimal_points([line for line in whole if line[:1] != "#"], mark, where=str(path))
     table = Table.read(lines, format="ascii.csv", delimiter=mark, comment="#", guess=False)
-    refuse_open_quotes(lines, len(table), where=str(path))
+    refuse_open_quotes(whole, len(table), where=str(path))
     refuse_foreign_numbers(columns_of_numbers(table), lines, mark, where=str(path))
     return table
 

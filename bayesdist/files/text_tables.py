@@ -267,8 +267,8 @@ def refuse_open_quotes(
         return
     odd = next((number for number, line in rows if line.count('"') % 2), None)
     raise FormatError(
-        f"has {n_lines} rows, of which {n_rows} can be read, since a cell begins with a quotation "
-        'mark (") and does not end in its line',
+        f"has {n_lines} lines of cells, and {n_rows} rows can be read, since a cell begins with a "
+        'quotation mark (") and does not end in its line',
         where=where if odd is None else f"{where}, line {odd}",
         do="close or remove the quotation mark, and write no line breaks within a cell",
     )

@@ -85,6 +85,13 @@ def test_open_quotation_marks_swallow_no_rows(tmp_path, rng):
                 read_table(path)
 
 
+def test_the_line_of_an_open_quotation_mark_counts_comments(tmp_path):
+    path = tmp_path / "stars.csv"
+    path.write_text('# a\n# b\nname,x,y\na,1,2\n"b,3,4\nc,5,6\n"d,7,8\n')
+    with pytest.raises(FormatError, match=r"line 5: .*quotation mark"):
+        read_table(path)
+
+
 def test_a_fits_file_whose_last_record_is_not_whole(tmp_path):
     """The objects of a further chip may be missing."""
     path = tmp_path / "stars.fits"
