@@ -76,8 +76,8 @@ STAGES: Mapping[str, tuple[str, ...]] = {
     "export": ("products",),
     "report": ("figures",),
 }
-# artefacts and what was derived from them that pickled runs keep if they have been used
 PROVENANCE = ("command", "created", "seed", "inputs", "versions")  # facts of run.json
+# artefacts, and what was derived from them, that pickled runs keep if they have been used
 RESULTS = ("posterior", "diagnostics", "evaluation")
 DERIVED = ("solution", "previous", "report_data")
 ORDER = {name: place for place, names in enumerate(STAGES.values()) for name in names}

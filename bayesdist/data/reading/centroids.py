@@ -85,7 +85,7 @@ def with_variances(table: Table, source: str) -> Table:
         if lower.keys() & others or variances[2] in lower:
             return table
         columns = [np.ma.asarray(without_unit(table[lower[name]])) for name in axes]
-        for name, values in zip(axes[:2], columns, strict=False):
+        for name, values in zip(axes[:2], columns[:2], strict=True):
             bad = np.ma.filled(values <= 0, fill_value=False)
             if bad.any():
                 row = int(np.argmax(bad))

@@ -116,9 +116,14 @@ def with_prior_motions(
     return out, (*notes, note)
 
 
+def _named(table: Table, wanted: str) -> str | None:
+    """Name of a column in any case; None if the table has no such column."""
+    return next((name for name in table.colnames if name.lower() == wanted), None)
+
+
 def _without_solution(table: Table) -> Bool:
     """Mask (N,) of stars for which Gaia has solved the position alone."""
-    name = next((n for n in table.colnames if n.lower() == "astrometric_params_solved"), None)
+    name = _named(table, "astrometric_params_solved")
     if name is None:
         return np.zeros(len(table), bool)
     return np.asarray(np.ma.filled(np.ma.asarray(table[name]), 0) == TWO_PARAMETERS)
@@ -135,7 +140,7 @@ def _refuse_missing_errors(quantities: Quantities, measured: Bool) -> None:
 
 def _doubtful(table: Table) -> tuple[str, ...]:
     """Note on stars whose solution Gaia's documentation doubts; empty if there are none."""
-    name = next((n for n in table.colnames if n.lower() == "ruwe"), None)
+    name = _named(table, "ruwe")
     if name is None:
         return ()
     values = np.ma.filled(np.ma.asarray(table[name]), 0.0)
@@ -150,8 +155,7 @@ def _doubtful(table: Table) -> tuple[str, ...]:
 
 def _magnitudes(table: Table, found: Mapping[str, str]) -> Float:
     """Magnitudes (N,) of the catalogue if it is Gaia, else of the table; NaN if unknown."""
-    lower = {name.lower(): name for name in table.colnames}
-    name = lower.get("phot_g_mean_mag", found.get("mag"))
+    name = _named(table, "phot_g_mean_mag") or found.get("mag")
     out = np.full(len(table), np.nan)
     if name is None:
         return out

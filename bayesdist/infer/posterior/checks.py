@@ -77,7 +77,8 @@ class ChiSquare:
         ratio = self.total / self.dof if self.dof > 0 else float("nan")
         small = scatter_too_small(self.total, self.dof)
         doubt = EITHER if small and not self.in_circle else ""
-        if self._large(ratio) and self.radius_doubt and not findings:
+        unexplained = ratio > CHI2_TOO_LARGE.value and not self.false_matches and not findings
+        if unexplained and self.radius_doubt:
             doubt = LARGER
         return Check(
             FIT,
@@ -88,10 +89,6 @@ class ChiSquare:
             self._sentence(small, findings),
             doubt,
         )
-
-    def _large(self, ratio: float) -> bool:
-        """True if chi-square is large for reasons that the posterior does not explain."""
-        return ratio > CHI2_TOO_LARGE.value and not self.false_matches
 
     def _sentence(self, small: bool, findings: Sequence[str]) -> str:
         """Sentence on a chi-square that is not about one; empty where it is."""
