@@ -65,21 +65,28 @@ def _refuse_unfounded(raw: bytes, budget: Budget) -> None:
         budget.refuse_parts(number, "HDUs")
         clock()
     if number:
-        refuse_cut_records(raw, budget)
+        refuse_rest(raw, at, budget)
 
 
-def refuse_cut_records(raw: bytes, budget: Budget) -> None:
-    """Raise FormatError if a file is not a multiple of records long (FITS 4.0, section 3.1).
+def refuse_rest(raw: bytes, end: int, budget: Budget) -> None:
+    """Raise FormatError if a file does not end where its last HDU does.
 
-    Its HDUs may be complete, and further ones missing.  A remainder of blanks is accepted: it is
-    no part of an HDU.
+    `end`: size in bytes of the HDUs, each in whole records (FITS 4.0, section 3.1). Zeros, blanks
+    and line ends after the last HDU are accepted: tapes and transfers add them.
     """
-    if raw[len(raw) // RECORD * RECORD :].strip(b" "):
+    if len(raw) < end:
         raise FormatError(
-            f"has {len(raw)} bytes, which are not whole records of {RECORD}, so that further HDUs "
-            "may be missing",
+            f"has {len(raw)} bytes, and its HDUs take up {end}",
             where=budget.where,
-            do="it is truncated or damaged: fetch or write it again",
+            do="it is truncated: fetch or write it again",
+        )
+    rest = len(raw[end:].rstrip(b"\0 \r\n"))
+    if rest:
+        raise FormatError(
+            f"has {rest} bytes after its last HDU that are none, so that further HDUs may be "
+            "damaged or missing",
+            where=budget.where,
+            do="fetch or write it again",
         )
 
 

@@ -107,7 +107,7 @@ def read_ecsv(path: Path, limits: Limits = LIMITS) -> Table:
         mark = _mark_of_ecsv(lines)
         lines = _whole_lines(lines, mark, path)
         table = Table.read(lines, format="ascii.ecsv")
-        refuse_open_quotes(lines, len(table), where=str(path))
+        refuse_open_quotes(lines, table, mark, where=str(path))
         if any(map(MAYBE_FOREIGN.search, lines)):  # else the header need not be parsed again
             refuse_foreign_numbers(_columns_of_ecsv(lines), lines, mark, where=str(path))
         return table
@@ -140,7 +140,7 @@ def _read_separated(path: Path, limits: Limits, *, mark: str) -> Table:
     # the time astropy needs for a comment grows with the square of its length
     lines = with_decimal_points([line for line in whole if line[:1] != "#"], mark, where=str(path))
     table = Table.read(lines, format="ascii.csv", delimiter=mark, comment="#", guess=False)
-    refuse_open_quotes(whole, len(table), where=str(path))
+    refuse_open_quotes(whole, table, mark, where=str(path))
     refuse_foreign_numbers(columns_of_numbers(table), lines, mark, where=str(path))
     return table
 

@@ -196,9 +196,10 @@ def parse_text_table(lines: Sequence[str], budget: Budget) -> Table:
     else:
         refuse_cut_end(original_lines, mark, where=file_name)
     if kind == "ascii.commented_header":
-        heads = [k for k, line in enumerate(lines) if line.strip().startswith("#")]
+        comments = [k for k, line in enumerate(lines) if line.strip().startswith("#")]
+        above = set(comments[:-1])  # of the line of names
         # astropy takes a tab between two names for the separator of all names
-        lines = [line.replace("\t", " ") for k, line in enumerate(lines) if k not in heads[:-1]]
+        lines = ["" if k in above else line.replace("\t", " ") for k, line in enumerate(lines)]
     elif separated:
         lines = without_empty_names(lines, mark)
         lines = with_decimal_points(lines, mark, where=file_name)
@@ -210,8 +211,7 @@ def parse_text_table(lines: Sequence[str], budget: Budget) -> Table:
         elif mark == ";":
             options["delimiter"] = mark
     table = Table.read(lines, format=kind, guess=False, **options)
-    if kind != "ascii.daophot":  # one row has several lines
-        refuse_open_quotes(lines, len(table), where=file_name, names=separated or ecsv)
+    refuse_open_quotes(lines, table, mark, where=file_name)
     refuse_foreign_numbers(columns_of_numbers(table), lines, mark, where=file_name)
     return table
 
@@ -247,31 +247,30 @@ def refuse_missing_cells(lines: Sequence[str], mark: str, *, where: str) -> None
         width, row = width or len(cells), row + 1
 
 
-def refuse_open_quotes(
-    lines: Sequence[str], n_rows: int, *, where: str, names: bool = True
-) -> None:
-    """Raise FormatError if a quotation mark that is not closed in its line has swallowed rows.
+def refuse_open_quotes(lines: Sequence[str], table: Table, mark: str | None, *, where: str) -> None:
+    """Raise FormatError if a quotation mark that is not closed has swallowed rows.
 
-    `lines`: lines of the table. `n_rows`: number of rows that were read. `names`: True if a line of
-    column names is among the lines that are not comments.
+    The cell that it opens then has line breaks, and at least one number for each column of numbers
+    in the table. Line breaks alone are allowed. `mark`: separator of cells; None for blanks.
     """
     if not any('"' in line for line in lines):
         return
-    rows = [
-        (number, line)
-        for number, line in enumerate(lines, start=1)
-        if line.strip() and not line.lstrip().startswith(("#", "\\", "|"))
-    ]
-    n_lines = len(rows) - names
-    if n_rows >= n_lines:
-        return
-    odd = next((number for number, line in rows if line.count('"') % 2), None)
-    raise FormatError(
-        f"has {n_lines} lines of cells, and {n_rows} rows can be read, since a cell begins with a "
-        'quotation mark (") and does not end in its line',
-        where=where if odd is None else f"{where}, line {odd}",
-        do="close or remove the quotation mark, and write no line breaks within a cell",
-    )
+    fewest = max(1, sum(columns_of_numbers(table).values()))
+    bare = ("\n" if line[:1] in ("#", "\\", "|") else line.rstrip("\r\n") + "\n" for line in lines)
+    records = csv.reader(bare, delimiter=mark or " ", skipinitialspace=True)
+    first = 1  # line in which a row begins
+    for cells in records:
+        for cell in cells:
+            inside = cell.split("\n") if "\n" in cell.rstrip("\n") else []
+            words = [word.strip(_BLANKS) for line in inside for word in line.split(mark or " ")]
+            if sum(_NUMBER.fullmatch(word) is not None for word in words) >= fewest:
+                raise FormatError(
+                    f'a cell begins with a quotation mark (") and goes on through {len(inside)} '
+                    "lines, so that rows are lost within it",
+                    where=f"{where}, line {first}",
+                    do="close or remove the quotation mark",
+                )
+        first = records.line_num + 1
 
 
 def refuse_cut_end(lines: Sequence[str], mark: str | None, *, where: str) -> None:

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.errors import FormatError, InputError, required
 from bayesdist.files.atomic import refuse_unsafe_name
-from bayesdist.files.fits import refuse_cut_records
 from bayesdist.plugin import objects
 from bayesdist.products.common.content import Content, read_content, readable
 from bayesdist.products.common.document import (
@@ -76,7 +75,7 @@ def recognized(content: Content) -> Document:
     """Document of content in memory; see `open_document`."""
     with readable(content.name):
         if content.is_fits and all(hdu.state == "whole" for hdu in content.hdus):
-            refuse_cut_records(content.raw, content.budget)
+            content.refuse_rest()
         for hdu in content.hdus:
             if not isinstance(hdu.header.get("EXTNAME", ""), str):
                 raise FormatError(

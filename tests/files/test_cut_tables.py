@@ -10,6 +10,7 @@ from astropy.table import Table
 
 from bayesdist.errors import FormatError
 from bayesdist.files.tables import read_table
+from bayesdist.products.registry import open_document
 
 KINDS = {
     "a.ecsv": {"format": "ascii.ecsv"},
@@ -85,22 +86,43 @@ def test_open_quotation_marks_swallow_no_rows(tmp_path, rng):
                 read_table(path)
 
 
-def test_the_line_of_an_open_quotation_mark_counts_comments(tmp_path):
+@pytest.mark.parametrize("first", ["name,x,y", "# name x y"])
+def test_the_line_of_an_open_quotation_mark_counts_comments(tmp_path, first):
     path = tmp_path / "stars.csv"
-    path.write_text('# a\n# b\nname,x,y\na,1,2\n"b,3,4\nc,5,6\n"d,7,8\n')
+    text = f'# a\n# b\n{first}\na,1,2\n"b,3,4\nc,5,6\n"d,7,8\n'
+    path.write_text(text.replace(",", " ") if first[0] == "#" else text)
     with pytest.raises(FormatError, match=r"line 5: .*quotation mark"):
         read_table(path)
 
 
-def test_a_fits_file_whose_last_record_is_not_whole(tmp_path):
+def test_cells_with_line_breaks_are_read(tmp_path, rng):
+    table = Table({name: rng.normal(size=30).round(4) for name in "xyuv"})
+    table["note"] = [
+        "in 2 visits, of\nwhich one is 1.5 s, and blended" if k % 7 else "none" for k in range(30)
+    ]
+    for name, options in KINDS.items():
+        if options["format"] not in ("ascii.tab", "ascii.basic"):  # astropy cannot read those again
+            path = tmp_path / name
+            table.write(path, **options)
+            assert list(read_table(path)["note"]) == list(table["note"])
+
+
+def test_a_fits_file_that_does_not_end_with_its_last_hdu(tmp_path):
     """The objects of a further chip may be missing."""
     path = tmp_path / "stars.fits"
     Table({"x": [1.0, 2.0]}).write(path)
     raw = path.read_bytes()
-    for damaged in (raw[:-1], raw + b"XTENS"):
+    for damaged, message in (
+        (raw[:-1], r"its HDUs take up"),
+        (raw + b"XTENS", r"5 bytes after its last HDU"),
+        (raw + b"XTENSIOM= 'BINTABLE'" + bytes(2860), r"20 bytes after its last HDU"),
+    ):
         path.write_bytes(damaged)
-        with pytest.raises(FormatError, match=r"not whole records of 2880"):
+        with pytest.raises(FormatError, match=message):
             read_table(path)
-    for more in (bytes(2880), b" " * 240):  # as on tapes; as test data of astropy.wcs
+        with pytest.raises(FormatError, match=message):
+            open_document(path)
+    # as on tapes; as test data of astropy.wcs; as other programs leave them
+    for more in (bytes(2880), b" " * 240, bytes(512), b"\n", b"\0\r\n"):
         path.write_bytes(raw + more)
         assert len(read_table(path)) == 2

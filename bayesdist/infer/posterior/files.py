@@ -1,7 +1,7 @@
 """Read and write solutions as netCDF files.
 
 Files are replaced atomically; any problem in reading raises a single `FormatError`. A checksum
-shows whether the content has been changed.
+shows whether what was written has been changed; what others add is ignored.
 
 fit.nc holds a linear fit. posterior.nc holds a posterior as a tree that ArviZ and xarray can open,
 with the groups posterior, sample_stats and diagnostics. For tables in memory it also has
@@ -47,7 +47,7 @@ MOST_STARS = 1_000_000  # the file repeats the data of at most this many stars
 LARGEST = 16_000_000  # bytes; a larger log-likelihood (per star and draw) is not stored
 FIT_NUMBERS = ("n_rows", "n_used", "rms_u", "rms_v", "rms_rejected", "chi2", "dof", "condition")
 CHECKED = ("", "posterior", "sample_stats", "diagnostics")  # groups of posterior.nc that are read
-UNCHECKED = ("checksum", "provenance", "wall_s")  # the last two differ between equal runs
+UNCHECKED = ("provenance", "wall_s")  # attributes that differ between equal runs
 
 
 @takes(posterior=Posterior, matches=(Matches, NoneType))
@@ -260,24 +260,41 @@ def _refuse_other_shape(values: NDArray[Any], shape: tuple[int, ...]) -> None:
         raise ValueError("an array has values that are not finite")
 
 
-def _checksum(groups: Mapping[str, NetcdfGroup]) -> str:
-    """SHA-256 of the content of groups, apart from the attributes `UNCHECKED`."""
-    digest = hashlib.sha256()
-    for group_name, group in sorted(groups.items()):
-        names = [name for name in sorted(group.attrs) if name not in UNCHECKED and name[0] != "_"]
-        attributes = [[name, np.asarray(group.attrs[name]).tolist()] for name in names]
-        digest.update(f"{group_name} {json.dumps(attributes)}\n".encode())
-        for name, values in sorted(group.arrays.items()):
+def _checked(groups: Mapping[str, NetcdfGroup]) -> list[list[str]]:
+    """Group and name of each attribute and variable that the checksum covers."""
+    return [
+        [group, name]
+        for group in sorted(groups)
+        for name in sorted({*groups[group].attrs, *groups[group].arrays})
+        if name not in UNCHECKED
+    ]
+
+
+def _checksum(groups: Mapping[str, NetcdfGroup], checked: list[list[str]]) -> str:
+    """SHA-256 of attributes and variables of groups; KeyError if one is missing."""
+    digest = hashlib.sha256(json.dumps(checked).encode())
+    for group, name in checked:
+        if name in groups[group].arrays:
+            values = groups[group].arrays[name]
             is_text = values.dtype.kind in "OU"
             kind = "text" if is_text else values.dtype.str
-            digest.update(f"{name} {kind} {values.shape}\n".encode())
+            digest.update(f"{kind} {values.shape}\n".encode())
             digest.update(json.dumps(values.tolist()).encode() if is_text else values.tobytes())
+        else:
+            digest.update(json.dumps(np.asarray(groups[group].attrs[name]).tolist()).encode())
     return digest.hexdigest()
 
 
 def _refuse_changed(groups: Mapping[str, NetcdfGroup]) -> None:
     """Raise FormatError if the content of a file contradicts its checksum."""
-    if groups[""].attrs["checksum"] != _checksum(groups):
+    attrs = groups[""].attrs
+    if "checksum" not in attrs:
+        raise FormatError("it has no checksum: an earlier revision of bayesdist wrote it")
+    try:
+        agrees = attrs["checksum"] == _checksum(groups, _tree(attrs["checked"]))
+    except KeyError:
+        agrees = False
+    if not agrees:
         raise FormatError("its content contradicts its checksum: it is damaged or was changed")
 
 
@@ -381,9 +398,9 @@ def _write(groups: Mapping[str, Group], path: str | Path) -> None:
     with h5netcdf.File(buffer, "w") as file:
         for name, group in groups.items():
             _fill(file.create_group(name) if name else file, group)
-        file.attrs["checksum"] = _checksum(
-            {name: _as_read(groups[name]) for name in CHECKED if name in groups}
-        )
+        written = {name: _as_read(groups[name]) for name in CHECKED if name in groups}
+        checked = _checked(written)
+        file.attrs.update(checked=json.dumps(checked), checksum=_checksum(written, checked))
     with atomic_path(path) as temporary:
         temporary.write_bytes(buffer.getvalue())
 

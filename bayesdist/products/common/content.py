@@ -36,6 +36,7 @@ from bayesdist.files.fits import (
     padded,
     refuse_long_arrays,
     refuse_many_rows,
+    refuse_rest,
 )
 from bayesdist.files.unpacked import read_unpacked
 from bayesdist.products.common.cards import card_images, header_of
@@ -178,16 +179,19 @@ class Content:
         hdus = self.hdus if self.is_fits else ()
         if not hdus or self.raw[:9] != HDU_STARTS[0]:
             raise FormatError("is no FITS file", where=self.name, do="check the file")
-        end = sum(len(hdu.to_bytes()) for hdu in hdus)
-        broken = any(hdu.state != "whole" for hdu in hdus)
-        if broken or end > len(self.raw) or self.raw[end:].strip(b"\0 "):
+        broken = next((hdu for hdu in hdus if hdu.state != "whole"), None)
+        if broken is not None:
             raise FormatError(
-                f"is truncated or damaged: {len(self.raw)} bytes, and {len(hdus)} HDUs end at "
-                f"{end if not broken else 'more'}",
+                f"has {len(self.raw)} bytes, and HDU {broken.number} takes up more",
                 where=self.name,
-                do="fetch the file again",
+                do="it is truncated or damaged: fetch or write it again",
             )
+        self.refuse_rest()
         return hdus
+
+    def refuse_rest(self) -> None:
+        """Raise FormatError for a FITS file that does not end where its last HDU does."""
+        refuse_rest(self.raw, sum(len(hdu.to_bytes()) for hdu in self.hdus), self.budget)
 
     @cached_property
     def tables(self) -> tuple[Hdu, ...]:

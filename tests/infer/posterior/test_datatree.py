@@ -36,7 +36,7 @@ def test_the_tree_has_the_content_of_the_file(posterior, tmp_path):
             for key, values in stored[name].data_vars.items():
                 np.testing.assert_array_equal(tree[name][key], values)
                 assert tree[name][key].dims == values.dims
-            assert set(tree[name].attrs) == set(stored[name].attrs) - {"checksum"}, name
+            assert set(tree[name].attrs) == set(stored[name].attrs) - {"checked", "checksum"}, name
     alone = drawn.to_datatree()
     assert set(alone.children) == {"posterior", "sample_stats", "diagnostics"}
     assert alone["posterior"]["theta"].dims == ("chain", "draw", "parameter")

@@ -395,3 +395,30 @@ def test_a_change_of_one_number_or_text_is_noticed(written, campaign, tmp_path, 
             with pytest.raises(FormatError, match=rf"{kind}\.nc"):
                 load(path)
     assert len(names) >= {"posterior": 28, "fit": 14}[kind], names
+
+
+@OF_ONE
+def test_what_others_add_to_a_posterior_is_ignored(written, tmp_path):
+    path = tmp_path / "posterior.nc"
+    path.write_bytes(written[2].read_bytes())
+    with h5py.File(path, "r+") as file:
+        file.attrs["history"] = "2026-11-30: scale added"
+        file["posterior"].attrs["history"] = "the same"
+        file["posterior/scale"] = file["posterior/theta"][..., 1] ** 2
+        file["summary/mean"] = [1.0, 2.0]
+    np.testing.assert_array_equal(load_posterior(path).theta, written[0].theta)
+
+
+@OF_ONE
+@pytest.mark.parametrize("kind", ["posterior", "fit"])
+def test_a_file_without_a_checksum_is_said_to_be_of_an_earlier_revision(
+    written, campaign, tmp_path, kind
+):
+    path, load = tmp_path / f"{kind}.nc", {"posterior": load_posterior, "fit": load_fit}[kind]
+    save_fit(campaign[2], path)
+    if kind == "posterior":
+        save_posterior(written[0], None, path)
+    with h5py.File(path, "r+") as file:
+        del file.attrs["checksum"]
+    with pytest.raises(FormatError, match=rf"{kind}\.nc.*no checksum: an earlier revision"):
+        load(path)
