@@ -9,14 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from bayesdist.app.artefacts.stars import in_circle
 from bayesdist.app.artefacts.stored_fit import write_stored_fit
 from bayesdist.app.assessment.diagnosing import holdout_summary, holdout_table
 from bayesdist.app.assessment.error_terms import idle_dates
 from bayesdist.app.assessment.periods import periods_summary, periods_table
-from bayesdist.app.kinds.matches.added_errors import (
-    added_errors_rows,
-    in_circle,
-)
 from bayesdist.app.rehearsal import rehearse_solution
 from bayesdist.app.run import Run
 from bayesdist.app.store.keys import attributes
@@ -28,6 +25,7 @@ from bayesdist.data import Matches
 from bayesdist.data.storage import write_columns
 from bayesdist.files.atomic import made_folder, remove_leftovers
 from bayesdist.infer import LinearFit, Posterior, save_posterior
+from bayesdist.infer.catalogue.added_errors import GroupedErrors
 from bayesdist.infer.posterior.memberships import memberships_of
 from bayesdist.infer.solution.geometry import geometries, skew_of
 from bayesdist.infer.stars.stars import in_table_order, prepare
@@ -141,7 +139,7 @@ def fit_sections(run: Run) -> dict[str, Any]:
     if errors.factor != 1.0:
         optional["error_scale"] = errors.factor
     if run.added_errors is not None:
-        optional["added_errors"] = added_errors_rows(run.added_errors)
+        optional["added_errors"] = _added_errors(run.added_errors)
     if run.config.fit.skew:
         optional["skew"] = _skew(fit)
     return {
@@ -162,6 +160,29 @@ def fit_sections(run: Run) -> dict[str, Any]:
             **optional,
         },
         **run.fit_facts,
+    }
+
+
+def _added_errors(found: GroupedErrors) -> dict[str, Any]:
+    """Entry 'added_errors' of the section 'fit'."""
+    columns = {
+        "n": found.n,
+        "added": found.sigma,
+        "added_error": found.sigma_error,
+        "excess": found.excess,
+        "variance": found.variance,
+        "variance_error": found.error,
+    }
+    return {
+        "grouping": found.grouping,
+        "by": found.by,
+        "evidence": dict(found.evidence),
+        "dispersion": found.dispersion,
+        "groups": [
+            {"label": label, "axis": axis} | {k: float(v[g, a]) for k, v in columns.items()}
+            for g, label in enumerate(found.labels)
+            for a, axis in enumerate("uv")
+        ],
     }
 
 

@@ -11,7 +11,7 @@ from astropy.wcs import WCS
 from numpy.polynomial import legendre
 
 from bayesdist.app.config import parse_config
-from bayesdist.app.kinds.matches.plausibility import doubts_on_stars, refuse_empty_segments
+from bayesdist.app.kinds.plausibility import doubts_on_stars, refuse_empty_segments
 from bayesdist.data import Matches, read_matches
 from bayesdist.errors import ConfigError, InputError
 from bayesdist.model import Chip, DistortionModel, TimeDependence

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -12,9 +13,9 @@ from bayesdist.data.matches import Matches
 from bayesdist.data.preparing import HoldoutSpec, exposures_drawn, split_matches
 from bayesdist.diagnose.residuals.stars import SAMPLE
 from bayesdist.errors import InputError
-from bayesdist.infer import Shards, load
+from bayesdist.infer import Shards, build_model, load
 from bayesdist.infer.stars.shards import Compute
-from bayesdist.model import DistortionModel
+from bayesdist.model import Chip, DistortionModel
 from bayesdist.utils.limits import HELD_OUT
 
 
@@ -107,6 +108,72 @@ class StarReader:
         if self._shards is not None:
             self._shards.close()
             self._shards = None
+
+
+def in_circle(stars: Matches, config: Config) -> bool:
+    """True if stars were matched within a known radius of nominal positions that are in the data.
+
+    The likelihood then accounts for this selection.
+    """
+    if config.begins_with != "fit" or not stars.has_nominal:
+        return False
+    return config.match_radius(stars.match_radius) is not None
+
+
+def model_of(stars: Matches, config: Config) -> DistortionModel:
+    """Distortion model of a configuration for the given stars."""
+    check_chips(config.chips(), stars.chip_numbers)
+    return build_model(
+        stars,
+        order=config.model.order,
+        size=config.detector.size,
+        reference_pixel=config.model.reference_pixel,
+        name=config.detector.name,
+        chips=config.chips(),
+        frames=config.model.frames,
+        time=config.time(),
+    )
+
+
+def shards_of(
+    stars: Matches, model: DistortionModel, config: Config, errors: ErrorLaw, reader: StarReader
+) -> Shards:
+    """Stars in shards for passes over the data; raises if any is outside its match circle."""
+    shards = reader.shards(model, stars, errors)
+    if in_circle(stars, config):
+        shards.survey.check_circle(config.match_radius(stars.match_radius))
+    return shards
+
+
+def check_chips(chips: Sequence[Chip], numbers: Sequence[int]) -> None:
+    """Refuse a ``[[chip]]`` block without stars, and stars without a block.
+
+    `numbers` are the chips of the matches, (1,) also if the matches name no chip.  Nothing is
+    checked if there are no blocks.
+    """
+    if not chips:
+        return
+    # stars without a chip are on the only chip, regardless of its number
+    if len(chips) == 1 and tuple(numbers) in ((1,), (chips[0].number,)):
+        return
+    block_numbers = {c.number for c in chips}
+    unknown = [str(n) for n in numbers if n not in block_numbers]
+    empty = [f"{c.number} ({c.name})" for c in chips if c.number not in set(numbers)]
+    if unknown:
+        plural = "chips" if len(unknown) > 1 else "chip"
+        raise InputError(
+            f"there are stars on {plural} {', '.join(unknown)}, which no [[chip]] block describes",
+            where="chip",
+            do=f"add a block, or leave these stars out (known: "
+            f"{', '.join(str(c.number) for c in chips)})",
+        )
+    if empty:
+        plural = "chips" if len(empty) > 1 else "chip"
+        raise InputError(
+            f"no star lies on {plural} {', '.join(empty)}",
+            where="chip",
+            do="drop the block, or map column 'chip' in data.columns",
+        )
 
 
 class RunInput(Protocol):

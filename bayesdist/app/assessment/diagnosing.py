@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
+from bayesdist.app.artefacts.stars import in_circle
 from bayesdist.app.assessment.error_terms import assessment_rng
 from bayesdist.app.assessment.periods import period_settings
-from bayesdist.app.kinds.matches.added_errors import in_circle
 from bayesdist.app.run import Run
 from bayesdist.app.store.summary import CoverageRow, Holdout, HoldoutTest
 from bayesdist.assess.domain import WHOLE, in_region

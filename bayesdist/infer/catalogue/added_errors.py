@@ -29,6 +29,7 @@ for both axes, by its own dispersion.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -58,6 +59,7 @@ SETTLED, TURNS = 1e-3, 50  # tolerance in ln variance, and maximum number of ite
 HALVINGS = 45  # number of bisections in the search for an added variance
 WIDER = 5.0  # smallest ratio of the scatter of false matches to that of typical good ones
 SHRUNK = 3  # smallest number of groups whose scatter can be estimated
+MOST_LISTED = 4  # largest number of groups that a sentence lists individually
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,6 +112,32 @@ class GroupedErrors:
         weight = np.maximum(self.n, 1e-300)
         average = np.sqrt(np.average(excess**2, axis=0, weights=weight))
         return AddedErrors(self.by, self.labels, excess, average)
+
+    def sentence(self, unit: str) -> str:
+        """Clause about errors in addition to the quoted ones; `unit` is that of u and v."""
+        evidence = ", ".join(f"{name} {gain:.3g}" for name, gain in self.evidence.items())
+        head = f"ln evidence gained by groups: {evidence}"
+        if self.grouping == ONE:
+            return f"one jitter for both axes ({head})"
+        each, joint = list(self._each()), ", "
+        if len(each) > MOST_LISTED:
+            each, joint = [min(each), max(each)], " to "
+        sizes = joint.join(
+            f"{value:.3g} +- {error:.2g} {unit} {group_name}" for value, error, group_name in each
+        )
+        return (
+            f"the errors beyond the quoted ones differ by {self.grouping}: {sizes} ({head}); what "
+            "each has beyond the least was added to the quoted errors, and the jitter is the least"
+        )
+
+    def _each(self) -> Iterator[tuple[float, float, str]]:
+        """Added error, its standard error, and the name of the group, for each group and axis."""
+        for g, label in enumerate(self.labels):
+            of = f"of {self.by} {label}" if self.by else ""
+            for a in range(2 if self.by_axis else 1):
+                along = f"along {'uv'[a]}" if self.by_axis else ""
+                group_name = " ".join(part for part in (along, of) if part)
+                yield float(self.sigma[g, a]), float(self.sigma_error[g, a]), group_name
 
 
 @dataclass(eq=False)

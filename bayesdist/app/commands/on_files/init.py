@@ -17,8 +17,8 @@ from bayesdist.app.commands.on_files.init_guesses import (
 )
 from bayesdist.app.config import parse_config
 from bayesdist.app.config.data import data_sections
-from bayesdist.app.kinds.matches.plausibility import scatter_about_polynomials
 from bayesdist.app.kinds.matches.sources import load_matches, mission_template
+from bayesdist.app.kinds.plausibility import scatter_about_polynomials
 from bayesdist.app.store.output import refuse_existing
 from bayesdist.data import FORMATS, Matches
 from bayesdist.data.formats.files import TableLayout, mission_formats, table_layout

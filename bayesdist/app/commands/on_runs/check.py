@@ -6,10 +6,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from bayesdist.app.artefacts.stars import in_circle
 from bayesdist.app.assessment.error_terms import idle_dates
 from bayesdist.app.config import load_config
-from bayesdist.app.kinds.matches.added_errors import grouping_sentence, in_circle
-from bayesdist.app.kinds.matches.plausibility import doubts_on_stars
+from bayesdist.app.kinds.plausibility import doubts_on_stars
 from bayesdist.app.rehearsal import rehearse
 from bayesdist.app.run import Run
 from bayesdist.app.screen import number
@@ -65,7 +65,7 @@ def _lines(run: Run) -> Iterator[str]:
         + (" (by magnitude)" if run.errors.by_magnitude is not None else "")
     )
     if run.added_errors is not None:
-        yield f"jitter       {grouping_sentence(run.added_errors, fit.unit)}"
+        yield f"jitter       {run.added_errors.sentence(fit.unit)}"
     yield f"model        order {model.order}, frames '{model.frames}', {model.n_params} parameters"
     if len(model.chips) > 1:
         counts = zip(model.chips, run.shards.survey.chips, strict=True)

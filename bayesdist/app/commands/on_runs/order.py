@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.app.artefacts.stars import QUOTED
+from bayesdist.app.artefacts.stars import QUOTED, model_of, shards_of
 from bayesdist.app.config import MatchesConfig, load_config
-from bayesdist.app.kinds.matches.stars import model_of, shards_of
 from bayesdist.app.run import Run
 from bayesdist.app.screen import table_text
 from bayesdist.app.store.output import refuse_existing, write_table

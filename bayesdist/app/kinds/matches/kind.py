@@ -8,9 +8,8 @@ from pathlib import Path
 
 from bayesdist.app.config import MatchesConfig
 from bayesdist.app.kinds.kind import RunKind
-from bayesdist.app.kinds.matches.added_errors import grouping_sentence
-from bayesdist.app.kinds.matches.plausibility import doubts_on_stars
 from bayesdist.app.kinds.matches.stars import fit_stars, match_stars, read_stars
+from bayesdist.app.kinds.plausibility import doubts_on_stars
 from bayesdist.app.run import Run
 from bayesdist.data import Matches
 from bayesdist.diagnose.checks import frames_doubt
@@ -53,7 +52,7 @@ class MatchesKind(RunKind[MatchesConfig, Matches]):
         if text := frames_doubt(fit, run.sample, suspicious=bool(majority or scale)):
             yield logging.WARNING, text
         if run.added_errors is not None:
-            yield logging.INFO, grouping_sentence(run.added_errors, fit.unit)
+            yield logging.INFO, run.added_errors.sentence(fit.unit)
         if majority:
             yield logging.WARNING, majority
 

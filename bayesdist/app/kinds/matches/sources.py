@@ -14,7 +14,6 @@ from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data import Matches, input_files, open_matches, read_matches
 from bayesdist.data.tables.parquet import describe_part
 from bayesdist.errors import InputError
-from bayesdist.model import Chip
 from bayesdist.plugin import mission_objects
 
 IN_MEMORY = 1_000_000  # rows of Parquet above which tables stay on disk
@@ -58,37 +57,6 @@ def is_large(path: PathLike | Sequence[PathLike]) -> bool:
     if any(file.suffix.lower() != ".parquet" for file in files):
         return False
     return sum(describe_part(file).n_rows for file in files) > IN_MEMORY
-
-
-def check_chips(chips: Sequence[Chip], numbers: Sequence[int]) -> None:
-    """Refuse a ``[[chip]]`` block without stars, and stars without a block.
-
-    `numbers` are the chips of the matches, (1,) also if the matches name no chip.  Nothing is
-    checked if there are no blocks.
-    """
-    if not chips:
-        return
-    # stars without a chip are on the only chip, regardless of its number
-    if len(chips) == 1 and tuple(numbers) in ((1,), (chips[0].number,)):
-        return
-    block_numbers = {c.number for c in chips}
-    unknown = [str(n) for n in numbers if n not in block_numbers]
-    empty = [f"{c.number} ({c.name})" for c in chips if c.number not in set(numbers)]
-    if unknown:
-        plural = "chips" if len(unknown) > 1 else "chip"
-        raise InputError(
-            f"there are stars on {plural} {', '.join(unknown)}, which no [[chip]] block describes",
-            where="chip",
-            do=f"add a block, or leave these stars out (known: "
-            f"{', '.join(str(c.number) for c in chips)})",
-        )
-    if empty:
-        plural = "chips" if len(empty) > 1 else "chip"
-        raise InputError(
-            f"no star lies on {plural} {', '.join(empty)}",
-            where="chip",
-            do="drop the block, or map column 'chip' in data.columns",
-        )
 
 
 Paths = str | Path | Sequence[str | Path]

@@ -7,7 +7,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
-from bayesdist.app.artefacts.stars import QUOTED, ErrorLaw, StarReader, set_aside
+from bayesdist.app.artefacts.stars import (
+    QUOTED,
+    ErrorLaw,
+    in_circle,
+    model_of,
+    set_aside,
+    shards_of,
+)
 from bayesdist.app.artefacts.stored_fit import (
     FIT,
     converged_posterior,
@@ -16,12 +23,8 @@ from bayesdist.app.artefacts.stored_fit import (
 )
 from bayesdist.app.config import Config, MatchesConfig
 from bayesdist.app.config.run import POSTERIOR, calibration_file
-from bayesdist.app.kinds.matches.added_errors import compared_errors, in_circle
-from bayesdist.app.kinds.matches.plausibility import (
-    refuse_empty_segments,
-    refuse_stars,
-)
-from bayesdist.app.kinds.matches.sources import check_chips, read_configured
+from bayesdist.app.kinds.matches.sources import read_configured
+from bayesdist.app.kinds.plausibility import refuse_empty_segments, refuse_stars
 from bayesdist.app.run import Run
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.tables.result_files import load_diagnostics
@@ -35,12 +38,11 @@ from bayesdist.errors import ConfigError, DegenerateError, NotSettledError
 from bayesdist.infer import (
     GaussianPriors,
     LinearFit,
-    Shards,
-    build_model,
     fit_by_magnitude,
     fit_linear,
     load_fit,
 )
+from bayesdist.infer.catalogue.added_errors import GroupedErrors, grouped_errors
 from bayesdist.infer.exposures.frame_choice import frames_that_help
 from bayesdist.infer.solution.geometry import geometries, refuse_geometry
 from bayesdist.infer.solution.linear import Rejection
@@ -78,21 +80,6 @@ def read_stars(config: MatchesConfig, base: Path) -> Matches:
     data, size = config.data, config.detector.size
     stars = read_configured(data.paths(base), data, size=size, chips=config.chip)
     return stars.named_below(str(base))
-
-
-def model_of(stars: Matches, config: Config) -> DistortionModel:
-    """Distortion model of a configuration for the given stars."""
-    check_chips(config.chips(), stars.chip_numbers)
-    return build_model(
-        stars,
-        order=config.model.order,
-        size=config.detector.size,
-        reference_pixel=config.model.reference_pixel,
-        name=config.detector.name,
-        chips=config.chips(),
-        frames=config.model.frames,
-        time=config.time(),
-    )
 
 
 def fit_stars(run: Run) -> Run:
@@ -178,14 +165,28 @@ def _fitted(
     return {"fit": linear, "errors": errors, "priors": priors, "added_errors": grouped}
 
 
-def shards_of(
-    stars: Matches, model: DistortionModel, config: Config, errors: ErrorLaw, reader: StarReader
-) -> Shards:
-    """Stars in shards for passes over the data; raises if any is outside its match circle."""
-    shards = reader.shards(model, stars, errors)
-    if in_circle(stars, config):
-        shards.survey.check_circle(config.match_radius(stars.match_radius))
-    return shards
+def compared_errors(
+    config: Config, fit: LinearFit, sample: Matches, priors: GaussianPriors
+) -> GroupedErrors | None:
+    """Errors added to groups of stars, or a single jitter, from a fit with the quoted errors.
+
+    None if groups are not compared: the errors come from the residuals, the jitter is given or is
+    to be a single one, or the match circle has truncated the residuals.
+    """
+    if not config.compares_jitters or in_circle(sample, config):
+        return None
+    by = config.outliers.jitter_by
+    try:
+        return grouped_errors(
+            sample,
+            fit,
+            by="" if by == "auto" else by,
+            outliers=config.outliers.model != "none",
+            priors=priors,
+        )
+    except DegenerateError as error:
+        log.info("fit: one jitter for all stars: groups are not compared, as %s", error.cause)
+        return None
 
 
 def priors_of(model: DistortionModel, config: Config) -> GaussianPriors:
