@@ -1,6 +1,5 @@
 """Public names and the modules that define them; each is imported on first use."""
 
-from .app.calibrate import calibrate as calibrate
 from .app.calibrations import read_calibration as read_calibration
 from .app.run import Run as Run
 from .app.runs import (
@@ -51,6 +50,7 @@ from .infer import (
     sample as sample,
     save_posterior as save_posterior,
 )
+from .kinds.matches.calibrate import calibrate as calibrate
 from .model import (
     Chip as Chip,
     DistortionModel as DistortionModel,

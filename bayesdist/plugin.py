@@ -39,9 +39,9 @@ class Mission:
     # file formats of matches, by name: each a `bayesdist.data.MatchFormat`
     match_formats: Mapping[str, str] = field(default_factory=dict)
     # format-specific keys of the section `[data]`, by the name of the format: each a subclass of
-    # `bayesdist.app.config.Data`
+    # `bayesdist.kinds.matches.config.Data`
     data_sections: Mapping[str, str] = field(default_factory=dict)
-    # readers of these formats: each a `bayesdist.app.kinds.matches.sources.MatchSource`
+    # readers of these formats: each a `bayesdist.kinds.matches.sources.MatchSource`
     match_sources: Mapping[str, str] = field(default_factory=dict)
     # kinds of `[[budget]]` rows with one sigma: each a callable (name, kind, sigma, solution,
     # source) that returns an error term, such as `bayesdist.assess.terms.parameters.ScaleError`
@@ -70,6 +70,8 @@ class Plugin:
     commands : mapping of str to str
         Commands at the top level, like those of the core, for kinds of runs that have some; each
         object is a `click.Command`.
+    first_commands : mapping of str to str
+        Such commands that help lists before those of the core, because a run begins with them.
     reports : tuple of str
         Modules that register figures, tables and sections with `bayesdist.report.contents.REPORT`.
     """
@@ -78,6 +80,7 @@ class Plugin:
     formats: Mapping[str, str] = field(default_factory=dict)
     missions: Mapping[str, Mission] = field(default_factory=dict)
     commands: Mapping[str, str] = field(default_factory=dict)
+    first_commands: Mapping[str, str] = field(default_factory=dict)
     reports: tuple[str, ...] = ()
 
 

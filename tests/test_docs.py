@@ -24,7 +24,7 @@ import bayesdist as bd
 from bayesdist import formats
 from bayesdist.app.cli import bayesdist as root
 from bayesdist.app.config import installed_kinds
-from bayesdist.app.config.data import data_sections
+from bayesdist.kinds.matches.config import data_sections
 from bayesdist.missions import wise
 from bayesdist.plugin import load_object
 

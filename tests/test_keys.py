@@ -12,7 +12,7 @@ import pytest
 from pydantic import BaseModel
 
 from bayesdist.app.config import installed_kinds, parse_config
-from bayesdist.app.config.data import data_sections
+from bayesdist.kinds.matches.config import data_sections
 from bayesdist.kinds.selfcal.patterns.config import PlanConfig
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"

@@ -31,7 +31,7 @@ COMMANDS = "bayesdist.app.commands"
 CORE = {
     name: f"{COMMANDS}.{module}:{name.replace('-', '_')}"
     for module, names in {
-        "runs": "init check run stage report requirements budget",
+        "runs": "check run stage report requirements budget",
         "planning": "plan select-order",
         "calibrations": "monitor compare inspect apply convert",
         "documentation": "docs",
@@ -55,7 +55,6 @@ EPILOG = (
 
 
 EXAMPLES = {
-    "init": "init camera.toml --matches stars.csv --size 2048 2048",
     "check": "check camera.toml",
     "run": "run camera.toml -o camera-run",
     "stage": "stage report camera-run --pdf",
@@ -80,7 +79,13 @@ def _renamed(name: str, new: str) -> RenamedError:
 
 def _commands_of_plugins() -> dict[str, str]:
     """Locations of the commands of plugins as "module:object", by the name of the command."""
-    return {k: where for plugin in plugins().values() for k, where in plugin.commands.items()}
+    others = {k: where for plugin in plugins().values() for k, where in plugin.commands.items()}
+    return _first_commands() | others
+
+
+def _first_commands() -> dict[str, str]:
+    """Those commands of plugins that help lists before the commands of the core."""
+    return {k: where for plugin in plugins().values() for k, where in plugin.first_commands.items()}
 
 
 class _Root(LazyGroup):
@@ -88,8 +93,9 @@ class _Root(LazyGroup):
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         next_to_core = [name for mission in missions().values() for name in mission.beside_core]
-        core = super().list_commands(ctx)
-        return [*next_to_core, *core, *_commands_of_plugins(), "simulate", *missions()]
+        names = [*next_to_core, *_first_commands(), *super().list_commands(ctx)]
+        later = [name for name in _commands_of_plugins() if name not in names]
+        return [*names, *later, "simulate", *missions()]
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         command = super().get_command(ctx, cmd_name)

@@ -3,7 +3,6 @@
 `Run` cannot import these modules.  Its members import the functions by name when they are called.
 """
 
-SOURCE = "bayesdist.app.kinds.matches.sources:input_of_run"
 DIAGNOSE = "bayesdist.app.assessment.diagnosing:diagnostics_of_run"
 CHECKS = "bayesdist.app.assessment.checks:checks_of_run"
 ERROR_MODEL = "bayesdist.app.assessment.error_terms:error_model_of_run"

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from functools import wraps
 from typing import Concatenate, ParamSpec, Protocol, TypeVar
 
-from bayesdist.app.config import MatchesConfig
+from bayesdist.app.config import installed_kinds
 from bayesdist.errors import BayesdistError
 
 # arguments of `bayesdist.calibrate` by the configuration keys that they set
@@ -38,9 +38,6 @@ SECTIONS = {
 OPTIONS = {"force": "overwrite=True", "resume": "resume=True", "seed": "seed"}
 # messages that name both the argument and the option are left as they are
 _BILINGUAL = re.compile(r"in Python|on the command line|of convert")
-_KEY = re.compile(
-    r"(?<![\w./\[\"])(" + "|".join(MatchesConfig.model_fields) + r")\.([a-z_]\w*)((?:\.\w+)*)"
-)
 _OPTION = re.compile(r"--(" + "|".join(OPTIONS) + r")\b")
 
 P = ParamSpec("P")
@@ -97,7 +94,9 @@ def _reworded(text: str, keys: bool) -> str:
     for section, argument in SECTIONS.items():
         text = text.replace(f"{section} blocks", argument).replace(f"a {section} block", argument)
         text = text.replace(section, argument)
-    return _KEY.sub(_argument, text)
+    sections = sorted({name for kind in installed_kinds().values() for name in kind.model_fields})
+    key = rf"(?<![\w./\[\"])({'|'.join(sections)})\.([a-z_]\w*)((?:\.\w+)*)"
+    return re.sub(key, _argument, text) if sections else text
 
 
 def _argument(match: re.Match[str]) -> str:

@@ -515,8 +515,9 @@ class Run:
     @classmethod
     def of(cls, directory: RunDirectory) -> Run:
         """Run of a directory; the caller must close it."""
-        source: RunInput | None = load_object(hooks.SOURCE)(directory)
-        return cls(directory, StarReader(directory.config.resources()), source=source)
+        config = directory.config
+        source: RunInput | None = load_object(config.kind).source(directory)
+        return cls(directory, StarReader(config.resources()), source=source)
 
     def having(self, **artefacts: Any) -> Run:
         """Run with the artefacts of a stage replaced, by name.

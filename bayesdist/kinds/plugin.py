@@ -4,10 +4,12 @@ from bayesdist.plugin import Plugin
 
 PLUGIN = Plugin(
     kinds={
+        "data": "bayesdist.kinds.matches.config:MatchesConfig",
         "campaign": "bayesdist.kinds.campaign.config:CampaignConfig",
         "selfcal": "bayesdist.kinds.selfcal.config:SelfcalConfig",
     },
     reports=("bayesdist.kinds.campaign.report", "bayesdist.kinds.selfcal.report"),
+    first_commands={"init": "bayesdist.kinds.matches.commands:init"},
     commands={
         "plan-dither": "bayesdist.kinds.selfcal.commands:plan_dither",
         "release": "bayesdist.kinds.campaign.commands:release",

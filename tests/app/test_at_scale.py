@@ -7,14 +7,14 @@ import pyarrow.parquet as pq
 import pytest
 
 from bayesdist.app.config import load_config
-from bayesdist.app.kinds.matches import sources as app_matches
-from bayesdist.app.kinds.matches.sources import load_matches
 from bayesdist.app.pipeline import fit
 from bayesdist.app.run import Run
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data import Matches, read_matches, write_partitioned
 from bayesdist.data.storage import StoredRows
 from bayesdist.infer import load_fit, load_posterior
+from bayesdist.kinds.matches import sources as app_matches
+from bayesdist.kinds.matches.sources import load_matches
 from bayesdist.model import TimeDependence
 from bayesdist.simulate import simulate_matches
 from tests.app.support import (

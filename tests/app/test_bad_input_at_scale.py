@@ -16,7 +16,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from bayesdist.app import saving
-from bayesdist.app.kinds.matches import sources as app_matches
+from bayesdist.kinds.matches import sources as app_matches
 from tests.app.support import (
     begin_stagewise,
     model_of,
@@ -191,7 +191,7 @@ def test_a_part_that_is_damaged_between_two_stages(job, tmp_path):
 
 def test_a_part_that_is_damaged_while_it_is_read(job, tmp_path, monkeypatch):
     """After the scan, before the passes: found when the piece is read, with its row group."""
-    from bayesdist.app.kinds.matches import stars
+    from bayesdist.kinds.matches import stars
 
     model_of = stars.model_of
     path = job.parent / "stars" / "b.parquet"

@@ -8,7 +8,7 @@ from astropy.table import Table
 from pyarrow.parquet import read_metadata
 from scipy.stats import binom
 
-from bayesdist.app.kinds.matches import sources as app_matches
+from bayesdist.kinds.matches import sources as app_matches
 from bayesdist.simulate import simulate_matches
 from tests.app.support import (
     SIGMA,

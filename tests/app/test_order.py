@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
-from bayesdist.app.kinds.matches import sources as app_matches
 from bayesdist.data import write_partitioned
+from bayesdist.kinds.matches import sources as app_matches
 from bayesdist.simulate import simulate_matches
 from tests.app.support import (
     SIGMA,

@@ -11,11 +11,11 @@ from astropy.table import Table
 from astropy.time import Time
 from lxml import html as lxml_html
 
-from bayesdist.app.kinds.matches import sources as app_matches
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data import Matches, write_partitioned
 from bayesdist.diagnose.periods import PeriodSettings, time_variation
 from bayesdist.infer import fit_linear
+from bayesdist.kinds.matches import sources as app_matches
 from bayesdist.model import Chip, DistortionModel
 from tests.app.support import (
     SIZE,

@@ -11,7 +11,6 @@ import pytest
 import bayesdist as bd
 from bayesdist.app.config import load_config
 from bayesdist.app.config.model import PriorCalibrationBlock
-from bayesdist.app.kinds.matches.stars import earlier_calibration
 from bayesdist.app.store import Record
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.calibration.calibration import calibration_of
@@ -19,6 +18,7 @@ from bayesdist.calibration.prior import prior_of_calibration
 from bayesdist.errors import InputError
 from bayesdist.infer import save_fit
 from bayesdist.infer.solution.linear import NO_REJECTION
+from bayesdist.kinds.matches.stars import earlier_calibration
 from tests.reduced import case_in_full, only_in_full
 
 from .support import as_table, good, refused

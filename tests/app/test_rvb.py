@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from astropy.table import Table, vstack
 
-from bayesdist.app.kinds.matches import sources
 from bayesdist.app.store import Record
 from bayesdist.data import open_matches
 from bayesdist.infer import load_fit
+from bayesdist.kinds.matches import sources
 from bayesdist.missions.wise.pairs.read import read_rvb
 from bayesdist.missions.wise.rvb.transform import RvbTransform
 from tests.app.rvb_jobs import DETECTORS, rvb_job, rvb_pairs, write_rvb_table

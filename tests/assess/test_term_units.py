@@ -7,10 +7,10 @@ import pytest
 from astropy import units as u
 
 import bayesdist as bd
-from bayesdist.app.calibrate import _budget
-from bayesdist.app.config.data import MatchesConfig
 from bayesdist.errors import InputError
 from bayesdist.infer.stars.stars import errors_of
+from bayesdist.kinds.matches.calibrate import _budget
+from bayesdist.kinds.matches.config import MatchesConfig
 
 
 @pytest.mark.parametrize("unit", ["pix", "arcsec", "mas"])

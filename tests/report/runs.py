@@ -19,7 +19,6 @@ import numpy as np
 from bayesdist.app.artefacts.parts import NO_TABLES, StoredLookupTables
 from bayesdist.app.artefacts.stars import QUOTED, ErrorLaw
 from bayesdist.app.kinds.kind import RunKind
-from bayesdist.app.kinds.matches.kind import MATCHES
 from bayesdist.assess import (
     Requirement,
     UserTerm,
@@ -39,6 +38,7 @@ from bayesdist.infer.posterior.checks import ChiSquare, fit_checks, sampling_che
 from bayesdist.infer.solution.linear import LinearFit, fit_linear, residuals
 from bayesdist.infer.stars.likelihood import OutlierMixture
 from bayesdist.infer.stars.loading import load
+from bayesdist.kinds.matches.kind import MATCHES
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 from tests.assess.by_draws import margins_by_draws
 from tests.budgets import detector_budget

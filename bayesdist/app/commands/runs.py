@@ -1,4 +1,4 @@
-"""Commands on runs: initial configuration, check, run, stages, requirements, budget, report."""
+"""Commands on runs: check, run, stages, requirements, budget, report."""
 
 from __future__ import annotations
 
@@ -7,44 +7,9 @@ from typing import Any
 
 import click
 
-from bayesdist.app.commands.options import ON_RUNS, Unused, column_names, command, force
+from bayesdist.app.commands.options import ON_RUNS, Unused, command
 
 STAGES = ("match", "fit", "sample", "diagnose", "evaluate", "assess", "export", "report")
-
-
-@command()
-@click.argument("config", metavar="CONFIG.toml", type=click.Path())
-@click.option(
-    "--matches", type=click.Path(), metavar="FILE", help="Table of matched stars; needed."
-)
-@click.option(
-    "--columns",
-    type=column_names,
-    metavar="KEY=NAME,...",
-    help="Names of columns that are not recognised; KEY= leaves one out.",
-)
-@click.option(
-    "--size",
-    nargs=2,
-    type=int,
-    metavar="NX NY",
-    show_default="guessed from the positions",
-    help="Number of columns and rows of each chip.",
-)
-@force
-def init(config: str, matches: str | None, **options: Any) -> None:
-    """Write a commented configuration for a table of matched stars."""
-    if matches is None:
-        toml = Path(config).with_suffix(".toml").name
-        table = config if toml != Path(config).name else "stars.csv"
-        raise click.UsageError(
-            f"--matches names the table: bayesdist init {toml} --matches {table}. A row of it is a "
-            "star with its pixels and its reference position; match two lists first (bayesdist "
-            "docs your_table). Of one list without reference positions a draft is written."
-        )
-    from bayesdist.app.commands.on_files.init import init as write_configuration
-
-    click.echo(write_configuration(config, matches, **options))
 
 
 @command(calls=f"{ON_RUNS}.check:check")

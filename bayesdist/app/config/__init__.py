@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from bayesdist.app.config.data import Data, MatchesConfig, StarsConfig
 from bayesdist.app.config.reading import (
     Config,
     config_of_record,
@@ -12,13 +11,12 @@ from bayesdist.app.config.reading import (
     load_text,
     parse_config,
 )
+from bayesdist.app.config.run import StarsConfig
 from bayesdist.app.config.section import ChipBlock
 
 __all__ = [
     "ChipBlock",
     "Config",
-    "Data",
-    "MatchesConfig",
     "StarsConfig",
     "config_of_record",
     "installed_kinds",

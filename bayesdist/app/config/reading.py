@@ -13,7 +13,6 @@ from typing import Annotated, Any, TypeAlias, Union
 from pydantic import Discriminator, Field, Tag, TypeAdapter, ValidationError
 
 from bayesdist.app.config.assess import RequirementBlock
-from bayesdist.app.config.data import MatchesConfig
 from bayesdist.app.config.errors import as_config_error
 from bayesdist.app.config.run import RunConfig
 from bayesdist.app.config.section import Section
@@ -32,8 +31,7 @@ def installed_kinds() -> dict[str, type[RunConfig]]:
 
     The plugins are asked at each call, not when this module is imported: their modules import it.
     """
-    ours: dict[str, type[RunConfig]] = {"data": MatchesConfig}
-    return ours | objects(lambda plugin: plugin.kinds, flaw=_flaw) | ours
+    return objects(lambda plugin: plugin.kinds, flaw=_flaw)
 
 
 def _flaw(kind: object) -> str:
@@ -79,6 +77,12 @@ def _refuse_other_kinds(
     kinds: Mapping[str, type[RunConfig]], raw: Mapping[str, Any], where: str
 ) -> None:
     """Refuse a configuration that begins with a section of no installed kind."""
+    if not kinds:
+        raise ConfigError(
+            "no kind of run is installed",
+            where=where,
+            do="leave the environment variable BAYESDIST_PLUGINS unset, or add 'kinds' to it",
+        )
     if _kinds_given(raw, kinds):
         return
     known = {section for kind in kinds.values() for section in kind.model_fields}

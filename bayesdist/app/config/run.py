@@ -22,16 +22,20 @@ from bayesdist.app.config.fit import (
     BaseSampler,
     ComputeBlock,
     DiscrepancyBlock,
+    Fit,
     HoldoutBlock,
+    Outliers,
     Periods,
+    Sampler,
 )
 from bayesdist.app.config.model import (
+    MatchedModel,
     PriorBlock,
     PriorCalibrationBlock,
     StructureBlock,
     TablesBlock,
 )
-from bayesdist.app.config.products import Products
+from bayesdist.app.config.products import MatchedProducts, Products
 from bayesdist.app.config.section import (
     ChipBlock,
     Circle,
@@ -309,6 +313,27 @@ class RunConfig(Section):
             replace(requirement, region=self.field) if requirement.region == WHOLE else requirement
             for requirement in requirements
         )
+
+
+class StarsConfig(RunConfig):
+    """Configuration whose stars are fitted like matched stars; a base for kinds of other packages.
+
+    Subclasses add the section that the run begins with, and define `kind`, `title` and
+    `named_files`.
+    """
+
+    tables: ClassVar[TablesBlock] = TablesBlock()
+    periods: ClassVar[None] = None
+    prior: ClassVar[tuple[PriorBlock, ...]] = ()
+    prior_calibration: ClassVar[None] = None
+
+    model: MatchedModel
+    fit: Fit = Fit()
+    outliers: Outliers = Outliers()
+    sampler: Sampler = Sampler()
+    compute: ComputeBlock = ComputeBlock()
+    holdout: HoldoutBlock | None = None
+    products: MatchedProducts = MatchedProducts()
 
 
 def _unit_of(block: BudgetBlock, unit: str) -> str:

@@ -117,3 +117,8 @@ def one_chip(detector: Detector, reference_pixel: Pair | None, number: int, name
     nx, ny = detector.size
     middle = ((nx + 1) / 2, (ny + 1) / 2)
     return Chip(number, detector.name or name, detector.size, reference_pixel or middle)
+
+
+def names_nominal(columns: Mapping[str, str] | None) -> bool:
+    """True if columns of nominal positions are named."""
+    return any((columns or {}).get(key) for key in ("u_nominal", "v_nominal"))

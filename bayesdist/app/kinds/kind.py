@@ -10,10 +10,12 @@ from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, TypeVar
 
 import numpy as np
 
+from bayesdist.app.artefacts.stars import ErrorLaw, RunInput
 from bayesdist.app.artefacts.stored_fit import read_stored_fit
 from bayesdist.app.kinds.further_exposures import FurtherExposures
 from bayesdist.app.kinds.sampling import sample_stars
 from bayesdist.app.run import Run
+from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess.model import with_diagnosed_errors
 from bayesdist.assess.terms.catalogue import fraction_of_bright
 from bayesdist.assess.terms.forms import ErrorTerm
@@ -86,9 +88,15 @@ class RunKind(ABC, Generic[C, I]):
     no_order: ClassVar[str] = ""
     # True if errors, requirements and products are tried out with the fit before it is sampled
     rehearses_fit: ClassVar[bool] = False
+    # True if new exposures may be given as tables of matches; see `read_new_matches`
+    reads_matches: ClassVar[bool] = False
     section: ClassVar[str] = ""  # section of summary.json on the matching
     has_catalogue: ClassVar[bool] = True  # star positions come from a reference catalogue
     along_detector: ClassVar[bool] = False  # u and v are along the detector axes, not along the sky
+
+    def source(self, directory: RunDirectory) -> RunInput | None:
+        """Matches that have to be selected or converted before they are read; usually None."""
+        return None
 
     # -- up to the posterior ----------------------------------------------------------------------
 
@@ -234,6 +242,31 @@ class RunKind(ABC, Generic[C, I]):
             Their fit.
         tuple of str
             Exposures that are left out because the run was made from them.
+        """
+        return None
+
+    def read_new_matches(
+        self, config: C, files: Path | list[Path], release: Run, *, dated: bool
+    ) -> Matches:
+        """Matches of new exposures with their errors, to test the solution of a run.
+
+        Parameters
+        ----------
+        config : RunConfig
+            Configuration of this kind that says how to read the files.
+        files : Path or list of Path
+        release : Run
+            Run whose solution is tested, of any kind.
+        dated : bool
+            True if a date in `config` is that of the new exposures; False if it is that of the
+            release.
+        """
+        raise NotImplementedError
+
+    def errors_before_fit(self, run: Run) -> ErrorLaw | None:
+        """Errors of stars that are compared with polynomials before a fit.
+
+        None if only a fit can put the stars of all exposures in one frame.
         """
         return None
 

@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.app.artefacts.stored_fit import load_errors
 from bayesdist.app.commands.on_runs.compare import joined
-from bayesdist.app.config import Config, MatchesConfig, load_config
-from bayesdist.app.kinds.matches.sources import read_configured
+from bayesdist.app.config import Config, load_config
+from bayesdist.app.kinds.kind import RunKind
 from bayesdist.app.run import Run
 from bayesdist.app.store.keys import attributes
 from bayesdist.app.store.output import record_folder, write_table
@@ -30,6 +29,7 @@ from bayesdist.infer.compare.change_date import PeriodScore, period_scores, scan
 from bayesdist.infer.compare.monitoring import NewFit, change_of, fit_new
 from bayesdist.infer.posterior.memberships import count_outliers
 from bayesdist.infer.solution.linear import Rejection
+from bayesdist.plugin import load_object
 from bayesdist.report.drawing import save_figures
 from bayesdist.report.figures.commands import change_over_time, difference_vectors
 
@@ -109,7 +109,7 @@ def _fitted(
     posterior, fitted = release.solution, release.kind.fit_of_new_exposures(release, new)
     if fitted is not None:
         return posterior, *fitted
-    matches, used_files = _new_matches(run, config, new)
+    matches, used_files = _new_matches(release, new)
     new_fit = fit_new(
         posterior,
         matches,
@@ -120,51 +120,39 @@ def _fitted(
     return posterior, matches, new_fit, used_files
 
 
-def _new_matches(run: RunDirectory, config: Config, new: Path) -> tuple[Matches, tuple[str, ...]]:
+def _new_matches(release: Run, new: Path) -> tuple[Matches, tuple[str, ...]]:
     """New matches with errors, read like those of the run or as a configuration of theirs states.
 
     The second value names files that are left out because the release was made from them.
     """
     if not new.exists():
         raise InputError("there is no such file", where=str(new), do="check the name")
-    configured = _configuration_of(run, new)
+    configured = _configuration_of(release.directory, new)
     path: Path | list[Path]
     if configured is not None:
-        stated, base = configured
-        size, chips = stated.detector.size, stated.chip
-        if not isinstance(stated, MatchesConfig):  # its exposures would have to be matched first
+        config, base = configured
+        kind: RunKind[Any, Any] = load_object(config.kind)
+        if not kind.reads_matches:  # its exposures would have to be matched first
             raise InputError(
                 "names no table of matches", where=str(new), do="give one in data.matches"
             )
-        data = stated.data
-        path = data.paths(base)
+        path = config.named_files(base)
     else:
-        path, size, chips = new, config.detector.size, config.chip
-        if not isinstance(config, MatchesConfig):  # other kinds read no tables of matches
+        config, kind, path = release.config, release.kind, new
+        if not kind.reads_matches:
             raise InputError(
                 "is a table, and this kind of run has no [data] that says how to read it",
                 where=str(new),
                 do="give a configuration whose [data] names it",
             )
-        # new exposures have another date than those of the run
-        data = config.data.model_copy(update={"epoch": None})
-    used_files = _files_of_release(run, path)
+    used_files = _files_of_release(release.directory, path)
     if used_files and not Path(new).is_dir():
         path = [file for file in input_files(path) if file not in used_files]
-    matches = read_configured(path, data, size=size, chips=config.chip or chips)
+    matches = kind.read_new_matches(config, path, release, dated=configured is not None)
     from_release = [k for k, name in enumerate(matches.sources) if Path(name) in used_files]
     if from_release:  # parts of one table that are read together
         matches = matches.load()
         matches = matches.select(~np.isin(matches.source, from_release))
-    if data.sigma == "by_magnitude":
-        errors = load_errors(run.path).by_magnitude
-        if errors is None:
-            raise InputError(
-                "errors by magnitude are asked for, and the run has measured none",
-                where=str(new),
-                do="give data.sigma another value",
-            )
-        matches = matches.with_errors(errors)
     return matches, tuple(str(file) for file in used_files)
 
 

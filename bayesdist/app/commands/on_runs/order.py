@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.app.artefacts.stars import QUOTED, model_of, shards_of
-from bayesdist.app.config import MatchesConfig, load_config
+from bayesdist.app.artefacts.stars import model_of, shards_of
+from bayesdist.app.config import load_config
 from bayesdist.app.run import Run
 from bayesdist.app.screen import table_text
 from bayesdist.app.store.output import refuse_existing, write_table
@@ -120,12 +120,8 @@ def _compared(run: Run, orders: Sequence[int], chip: int | None) -> OrderSelecti
     run = run.with_config(config)
     rejection = Rejection(config.fit.clip_chi2, config.fit.clip_abs)
     stars: Matches | Shards
-    one_frame = config.model.frames == "none" and config.time() is None
-    # stars that were matched before the run, of one map at all dates, need no fit
-    if isinstance(config, MatchesConfig) and len(config.chips()) < 2 and one_frame:
-        errors = QUOTED
-        if config.data.sigma == "by_magnitude":
-            errors = run.kind.fit(run).errors
+    errors = run.kind.errors_before_fit(run)
+    if errors is not None:
         model = model_of(run.stars, config)
         stars = shards_of(run.stars, model, config, errors, run.reader)
     else:

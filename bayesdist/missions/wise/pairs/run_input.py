@@ -10,8 +10,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, TypedDict
 
-from bayesdist.app.commands.on_files.init_guesses import column_lines
-from bayesdist.app.kinds.matches.sources import MatchSource, is_large
 from bayesdist.app.store.rundir import PAIRS, RunDirectory, part_files
 from bayesdist.data import Matches, input_files, open_matches, write_partitioned
 from bayesdist.data.tables.checks import Place
@@ -20,6 +18,8 @@ from bayesdist.data.tables.parquet import ParquetPart, describe_part
 from bayesdist.errors import InputError
 from bayesdist.files.atomic import made_folder
 from bayesdist.files.tables import read_table
+from bayesdist.kinds.matches.init_guesses import column_lines
+from bayesdist.kinds.matches.sources import MatchSource, is_large
 from bayesdist.missions.wise.pairs.files import (
     IPAC,
     MAGNITUDES,

@@ -7,8 +7,8 @@ from typing import ClassVar, Literal
 
 from pydantic import PositiveFloat, PositiveInt
 
-from bayesdist.app.config.data import Data
 from bayesdist.app.config.section import Section
+from bayesdist.kinds.matches.config import Data
 from bayesdist.missions.wise.pairs.radial_limit import RadialLimit
 
 

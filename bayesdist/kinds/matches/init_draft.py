@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from bayesdist.app.commands.on_files.init_guesses import detector_lines, quoted
 from bayesdist.app.config import parse_config
 from bayesdist.data import read_star_lists
 from bayesdist.data.formats.files import (
@@ -15,6 +14,7 @@ from bayesdist.data.formats.files import (
     mission_formats,
     table_layout,
 )
+from bayesdist.kinds.matches.init_guesses import detector_lines, quoted
 
 MAX_CANDIDATES = 40  # largest number of columns listed
 

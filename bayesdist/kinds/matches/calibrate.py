@@ -15,9 +15,8 @@ import numpy as np
 import tomli_w
 
 from bayesdist.app.artefacts.stars import StarReader
-from bayesdist.app.config import MatchesConfig, parse_config
+from bayesdist.app.config import parse_config
 from bayesdist.app.config.assess import RequirementBlock
-from bayesdist.app.kinds.matches.stars import read_stars
 from bayesdist.app.pipeline import diagnose, evaluate, sample
 from bayesdist.app.python_terms import in_python_terms
 from bayesdist.app.rehearsal import rehearse
@@ -33,6 +32,8 @@ from bayesdist.data.reading.options import check_sigma
 from bayesdist.data.reading.table import match_arguments
 from bayesdist.errors import ConfigError, InputError
 from bayesdist.infer import OutlierMixture
+from bayesdist.kinds.matches.config import MatchesConfig
+from bayesdist.kinds.matches.stars import read_stars
 from bayesdist.model import Chip, TimeDependence
 from bayesdist.utils.quantities import value_in, values_in, year_of
 

@@ -28,7 +28,13 @@ from bayesdist.app.config.model import (
 )
 from bayesdist.app.config.products import MatchedProducts
 from bayesdist.app.config.run import RunConfig, calibration_file
-from bayesdist.app.config.section import Epoch, RightAscensionDeclination, Section, Unit
+from bayesdist.app.config.section import (
+    Epoch,
+    RightAscensionDeclination,
+    Section,
+    Unit,
+    names_nominal,
+)
 from bayesdist.data import FORMATS
 from bayesdist.data.formats.files import mission_formats
 from bayesdist.data.tables.column import length_advice
@@ -94,11 +100,6 @@ class Data(Section):
             )
 
 
-def names_nominal(columns: Mapping[str, str] | None) -> bool:
-    """True if columns of nominal positions are named."""
-    return any((columns or {}).get(key) for key in ("u_nominal", "v_nominal"))
-
-
 def data_sections() -> dict[str, type[Data]]:
     """Section classes of formats that have additional keys, by format name."""
     return mission_objects(lambda mission: mission.data_sections)
@@ -133,31 +134,10 @@ def _of_its_format(raw: Any, handler: Any, info: ValidationInfo) -> Data:
 DataOfFormat = Annotated[SerializeAsAny[Data], WrapValidator(_of_its_format)]
 
 
-class StarsConfig(RunConfig):
-    """Configuration whose stars are fitted like matched stars; a base for kinds of other packages.
-
-    Subclasses add the section that the run begins with, and define `kind`, `title` and
-    `named_files`.
-    """
-
-    tables: ClassVar[TablesBlock] = TablesBlock()
-    periods: ClassVar[None] = None
-    prior: ClassVar[tuple[PriorBlock, ...]] = ()
-    prior_calibration: ClassVar[None] = None
-
-    model: MatchedModel
-    fit: Fit = Fit()
-    outliers: Outliers = Outliers()
-    sampler: Sampler = Sampler()
-    compute: ComputeBlock = ComputeBlock()
-    holdout: HoldoutBlock | None = None
-    products: MatchedProducts = MatchedProducts()
-
-
 class MatchesConfig(RunConfig):
     """Configuration of a run that begins with matched stars."""
 
-    kind: ClassVar[str] = "bayesdist.app.kinds.matches.kind:MATCHES"
+    kind: ClassVar[str] = "bayesdist.kinds.matches.kind:MATCHES"
     title: ClassVar[str] = "matched stars"
     begins_with: ClassVar[str] = "fit"
     tables: ClassVar[TablesBlock] = TablesBlock()

@@ -9,11 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from bayesdist.app.artefacts.stars import RunInput
-from bayesdist.app.config import ChipBlock, Data, MatchesConfig
+from bayesdist.app.config import ChipBlock
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data import Matches, input_files, open_matches, read_matches
 from bayesdist.data.tables.parquet import describe_part
 from bayesdist.errors import InputError
+from bayesdist.kinds.matches.config import Data
 from bayesdist.plugin import mission_objects
 
 IN_MEMORY = 1_000_000  # rows of Parquet above which tables stay on disk
@@ -84,16 +85,9 @@ class MatchSource:
     template: Callable[[str | Path], Template | None]
 
 
-def _source(name: str) -> MatchSource | None:
+def source_of(name: str) -> MatchSource | None:
     """Match source of a format; None for formats that are not of a mission."""
     return mission_objects(lambda mission: mission.match_sources, only=name).get(name)
-
-
-def input_of_run(run: RunDirectory) -> RunInput | None:
-    """Input of a run in the format of a mission; None for any other run."""
-    config = run.config
-    source = _source(config.data.format) if isinstance(config, MatchesConfig) else None
-    return None if source is None else source.input_of(run)
 
 
 def read_configured(
@@ -107,7 +101,7 @@ def read_configured(
 
     `size` is the number of columns and rows of a detector with a single chip.
     """
-    source = _source(data.format)
+    source = source_of(data.format)
     if source is not None and size is not None:
         return source.read(path, data, size)
     return load_matches(path, **reading_options(data, chips))

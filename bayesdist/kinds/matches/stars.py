@@ -21,9 +21,8 @@ from bayesdist.app.artefacts.stored_fit import (
     hierarchy_of,
     read_stored_fit,
 )
-from bayesdist.app.config import Config, MatchesConfig
+from bayesdist.app.config import Config
 from bayesdist.app.config.run import POSTERIOR, calibration_file
-from bayesdist.app.kinds.matches.sources import read_configured
 from bayesdist.app.kinds.plausibility import refuse_empty_segments, refuse_stars
 from bayesdist.app.run import Run
 from bayesdist.app.store.rundir import RunDirectory
@@ -46,6 +45,8 @@ from bayesdist.infer.catalogue.added_errors import GroupedErrors, grouped_errors
 from bayesdist.infer.exposures.frame_choice import frames_that_help
 from bayesdist.infer.solution.geometry import geometries, refuse_geometry
 from bayesdist.infer.solution.linear import Rejection
+from bayesdist.kinds.matches.config import MatchesConfig
+from bayesdist.kinds.matches.sources import read_configured
 from bayesdist.model import DistortionModel
 from bayesdist.products.registry import read_calibration
 

@@ -9,15 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bayesdist.app.commands.on_files.init_draft import draft_of
-from bayesdist.app.commands.on_files.init_guesses import (
-    column_lines,
-    detector_lines,
-    quoted,
-)
 from bayesdist.app.config import parse_config
-from bayesdist.app.config.data import data_sections
-from bayesdist.app.kinds.matches.sources import load_matches, mission_template
 from bayesdist.app.kinds.plausibility import scatter_about_polynomials
 from bayesdist.app.store.output import refuse_existing
 from bayesdist.data import FORMATS, Matches
@@ -25,6 +17,14 @@ from bayesdist.data.formats.files import TableLayout, mission_formats, table_lay
 from bayesdist.data.reading.table import NOT_FINITE_CAUSES
 from bayesdist.errors import InputError
 from bayesdist.files.atomic import atomic_path
+from bayesdist.kinds.matches.config import data_sections
+from bayesdist.kinds.matches.init_draft import draft_of
+from bayesdist.kinds.matches.init_guesses import (
+    column_lines,
+    detector_lines,
+    quoted,
+)
+from bayesdist.kinds.matches.sources import load_matches, mission_template
 
 log = logging.getLogger("bayesdist")
 

@@ -1,1 +1,0 @@
-"""Stars that were matched before the run: reading, mission formats, added errors."""

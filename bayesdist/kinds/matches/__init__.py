@@ -1,0 +1,1 @@
+"""Runs of stars that were matched before: configuration, reading, fit, `calibrate`, `init`."""
