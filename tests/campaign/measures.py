@@ -12,9 +12,9 @@ from scipy.stats import chi2
 
 from bayesdist.infer import fit_by_magnitude
 from bayesdist.infer.nodes import TableFit, TablePosterior, fit_with_tables
-from bayesdist.infer.series import Series, TrendModel, fit_series
 from bayesdist.infer.solution.solution import Solution, TransformedSolution
 from bayesdist.infer.solution.transforms import lines, reference_gauge, without_frames
+from bayesdist.kinds.campaign.series import Series, TrendModel, fit_series
 from bayesdist.missions.hst.simulate.pointings import SPANS
 from bayesdist.missions.hst.simulate.stars import centroid_error
 from bayesdist.model import corrected

@@ -14,10 +14,10 @@ from astropy.table import Table
 
 from bayesdist.app.run import Run
 from bayesdist.errors import InputError
-from bayesdist.infer.series import FilterDependence, Series, TrendModel, filter_dependence
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.infer.solution.transforms import linear_terms, lines, reference_gauge, without_frames
 from bayesdist.kinds.campaign.parts import ExposuresAlone
+from bayesdist.kinds.campaign.series import FilterDependence, Series, TrendModel, filter_dependence
 from bayesdist.model import TimeDependence
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.limits import DIFFERENCE

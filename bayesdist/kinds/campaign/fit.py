@@ -21,7 +21,6 @@ from bayesdist.infer.exposures.hierarchy import (
     trend_p_values,
 )
 from bayesdist.infer.nodes import corrected_matches, on_the_chips
-from bayesdist.infer.series import Series
 from bayesdist.infer.solution.linear import Rejection
 from bayesdist.kinds.campaign.input_validation import frames_not_set
 from bayesdist.kinds.campaign.inputs import Inputs
@@ -29,6 +28,7 @@ from bayesdist.kinds.campaign.linear_terms import FIXED, gap_priors, line_sectio
 from bayesdist.kinds.campaign.matched import affine_model_of
 from bayesdist.kinds.campaign.parts import ExposuresAlone, ExposureScatter
 from bayesdist.kinds.campaign.reference import rate_priors
+from bayesdist.kinds.campaign.series import Series
 from bayesdist.kinds.campaign.tables import fit_tables, scatter_by_magnitude, tables_section
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.model.frames import RIGID

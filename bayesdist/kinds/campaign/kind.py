@@ -148,9 +148,9 @@ class CampaignKind(RunKind[CampaignConfig, Inputs]):
 
     def save_diagnosed(self, run: Run) -> None:
         """Write the linear terms of the exposures as a function of time."""
-        from bayesdist.kinds.campaign import series  # slow to import
+        from bayesdist.kinds.campaign import time_dependence  # used by one stage
 
-        series.write_series_tables(run)
+        time_dependence.write_series_tables(run)
 
     def predictive(self, run: Run) -> Predictive:
         """Prediction with the scatter of exposures, and errors of catalogue and tables."""

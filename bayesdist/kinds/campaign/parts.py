@@ -9,7 +9,7 @@ import numpy as np
 from bayesdist.app.artefacts.parts import Part
 from bayesdist.infer import Posterior
 from bayesdist.infer.exposures.hierarchy import Settling
-from bayesdist.infer.series import Series
+from bayesdist.kinds.campaign.series import Series
 from bayesdist.utils.arrays import Float
 
 

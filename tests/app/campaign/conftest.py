@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from bayesdist.kinds.campaign import series
+from bayesdist.kinds.campaign import time_dependence
 from tests.app.support import edit, good
 
 # coarse nodes and few draws: quick.  Wider cells than the pattern's leave the linear terms alone;
@@ -35,16 +35,16 @@ def run(folder, full) -> Path:
     """The run of F606W.
 
     In full the course over time is told of the first term, and reported.  That of all would take
-    long; tests/infer/series shows what is said of it, and tests/report what campaigns show.
+    long; tests/kinds/campaign/series shows what is said of it, tests/report what campaigns show.
     """
-    out, of_term = folder / "run_f606w", series._verdict
+    out, of_term = folder / "run_f606w", time_dependence._verdict
 
     def first(exposures, k, *options):
         unsaid = {"term": exposures.coefficients[k], "claim": "not asked", "text": "Not asked."}
         return of_term(exposures, k, *options) if full and k == 0 else unsaid
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(series, "_verdict", first)
+        patch.setattr(time_dependence, "_verdict", first)
         if not full:
             patch.setattr("bayesdist.app.stages.report", lambda results, pdf: [])
         good("run", folder / "campaign_f606w.toml", "-o", out, "-q")

@@ -27,11 +27,11 @@ from bayesdist.formats.lookup.file import read_lookup_file
 from bayesdist.infer import load_fit, load_posterior
 from bayesdist.infer.exposures.shared_drift import drift_priors, with_drift_of
 from bayesdist.infer.nodes.fit import held_sigma
-from bayesdist.infer.series import Series, fit_series
 from bayesdist.infer.solution.transforms import linear_terms, lines, reference_gauge, without_frames
 from bayesdist.kinds.campaign.filters import compare_filters
 from bayesdist.kinds.campaign.reference import held_tables
 from bayesdist.kinds.campaign.release import _require_alike
+from bayesdist.kinds.campaign.series import Series, fit_series
 from bayesdist.missions.hst.simulate import acs_solution, making, read_acs, simulate_acs
 from bayesdist.model import LookupTable, TimeDependence, corrected
 from tests.app.support import carried_out, cli, good, one_sentence, replaced, snapshot
@@ -76,12 +76,12 @@ def by_filter(runs):
 def release(runs, folder, full):
     """The files of both filters, and what was said.
 
-    Reduced, trends with time have few sweeps; tests/infer/series looks at them.
+    Reduced, trends with time have few sweeps; tests/kinds/campaign/series looks at them.
     """
     out = folder.parent / "release"
     with pytest.MonkeyPatch.context() as patch:
         if not full:
-            comparing = import_module("bayesdist.infer.series.compare")
+            comparing = import_module("bayesdist.kinds.campaign.series.compare")
             patch.setattr(comparing, "fit_series", partial(fit_series, max_sweeps=200))
         text = good("release", *runs.values(), "-o", out, "-q").out
     return SimpleNamespace(path=out, text=text)
@@ -309,7 +309,7 @@ def exposures_of(campaign, filter: str, sigma: float = 2e-6) -> Series:
 
 
 @pytest.mark.slow
-@only_in_full("tests/infer/series/test_filters finds it")
+@only_in_full("tests/kinds/campaign/series/test_filters finds it")
 @pytest.mark.parametrize("own", [0.0, 6e-6])
 def test_a_drift_of_one_filter_only_is_found(own, monkeypatch):
     """B_2 of F814W drifts by a fifth more than the report's 3.5e-5 a year, or does not."""

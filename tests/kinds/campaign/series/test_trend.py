@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from bayesdist.errors import DegenerateError, InputError
-from bayesdist.infer.series import KINDS, Design, Series, TrendModel
-from bayesdist.infer.series.series import Drift
+from bayesdist.kinds.campaign.series import KINDS, Design, Series, TrendModel
+from bayesdist.kinds.campaign.series.series import Drift
 
 BREAKS = (2005.3, 2011.0)
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesdist.infer.series import Series, TrendModel, Verdict
+from bayesdist.kinds.campaign.series import Series, TrendModel, Verdict
 
 COEFFICIENTS = ("A_2", "B_2", "B_3")
 REFERENCE = (2004.5, 2012.5)

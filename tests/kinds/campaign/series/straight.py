@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.infer.series.series import Design, Series, TrendModel
+from bayesdist.kinds.campaign.series.series import Design, Series, TrendModel
 
 __all__ = ["StraightLines", "straight_lines"]
 

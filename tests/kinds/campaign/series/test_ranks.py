@@ -10,8 +10,8 @@ import pytest
 from scipy.stats import chisquare
 
 from bayesdist.infer.convergence import Limits
-from bayesdist.infer.series import Design, Series, TrendModel
-from bayesdist.infer.series.sampler import (
+from bayesdist.kinds.campaign.series import Design, Series, TrendModel
+from bayesdist.kinds.campaign.series.sampler import (
     FRACTION_PRIOR,
     KAPPA_RATE,
     MAX_FRACTION,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bayesdist.infer.series import (
+from bayesdist.kinds.campaign.series import (
     Series,
     TrendModel,
     block_folds,
@@ -16,7 +16,7 @@ from bayesdist.infer.series import (
     fit_series,
     serial_correlation,
 )
-from bayesdist.infer.series.posterior import held_out
+from bayesdist.kinds.campaign.series.posterior import held_out
 from tests.infer.calibration import over_seeds
 from tests.reduced import case_in_full, only_in_full
 

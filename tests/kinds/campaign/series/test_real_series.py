@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
-from bayesdist.infer.series import (
+from bayesdist.kinds.campaign.series import (
     HeldOut,
     Series,
     SeriesPosterior,
@@ -161,7 +161,7 @@ def test_the_end_of_the_measured_sectors_is_found(tess):
 
 
 @pytest.mark.slow
-@only_in_full("tests/infer/series/test_compare finds a break where it is")
+@only_in_full("tests/kinds/campaign/series/test_compare finds a break where it is")
 def test_decam_breaks_are_found(decam):
     """CCD S13 jumps in magnification between two seasons in 2015, or on the first dates of the
     second: plain to see, and told by nobody."""

@@ -48,7 +48,7 @@ from scipy.special import betainc, betaincinv, gammainc, gammaincinv
 
 from bayesdist.infer.convergence import Convergence, Limits, diagnose
 from bayesdist.infer.kernel import densities, draw_deviations, gaussians, precisions, shear
-from bayesdist.infer.series.series import MAD_TO_SIGMA, MIN_EXPOSURES_FOUND, Design, Series
+from bayesdist.kinds.campaign.series.series import MAD_TO_SIGMA, MIN_EXPOSURES_FOUND, Design, Series
 from bayesdist.utils.arrays import Bool, Float, Int
 
 ENSEMBLES = 4  # number of groups of chains that are compared to assess convergence

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from bayesdist.infer.kernel import precisions
-from bayesdist.infer.series import (
+from bayesdist.kinds.campaign.series import (
     Design,
     Series,
     TrendModel,
@@ -15,7 +15,7 @@ from bayesdist.infer.series import (
     fit_series,
     held_out,
 )
-from bayesdist.infer.series.sampler import WIDE, SeriesProblem, trend_equations
+from bayesdist.kinds.campaign.series.sampler import WIDE, SeriesProblem, trend_equations
 from tests.reduced import case_in_full
 
 from .straight import straight_lines

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom, chi2
 
-from bayesdist.infer.series import fit_series
+from bayesdist.kinds.campaign.series import fit_series
 from tests.infer.calibration import over_seeds
 from tests.reduced import only_in_full
 

@@ -21,7 +21,7 @@ from astropy.table import Table
 
 from bayesdist.errors import InputError
 from bayesdist.infer.kernel import precisions
-from bayesdist.infer.series.posterior import (
+from bayesdist.kinds.campaign.series.posterior import (
     Change,
     HeldOut,
     SeriesPosterior,
@@ -30,8 +30,13 @@ from bayesdist.infer.series.posterior import (
     fit_series,
     held_out,
 )
-from bayesdist.infer.series.sampler import WIDE, BreakMoves, SeriesProblem, normal_equations
-from bayesdist.infer.series.series import KINDS, Design, Series, TrendModel
+from bayesdist.kinds.campaign.series.sampler import (
+    WIDE,
+    BreakMoves,
+    SeriesProblem,
+    normal_equations,
+)
+from bayesdist.kinds.campaign.series.series import KINDS, Design, Series, TrendModel
 from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.distributions import t_ppf
 

@@ -11,8 +11,14 @@ from astropy.table import Table
 from bayesdist.app.run import Run
 from bayesdist.app.store.output import write_table
 from bayesdist.errors import DegenerateError
-from bayesdist.infer.series import Series, SeriesPosterior, TrendModel, describe, fit_series
 from bayesdist.kinds.campaign.parts import ExposuresAlone
+from bayesdist.kinds.campaign.series import (
+    Series,
+    SeriesPosterior,
+    TrendModel,
+    describe,
+    fit_series,
+)
 
 log = logging.getLogger("bayesdist")
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bayesdist.errors import DegenerateError, InputError
-from bayesdist.infer.series import Series, TrendModel, fit_series
+from bayesdist.kinds.campaign.series import Series, TrendModel, fit_series
 
 from .campaign import ALPHA, BETA, BREAK, LINES, REFERENCE, SCATTER, campaign
 

@@ -1,6 +1,6 @@
 """Trends of coefficients of many exposures with time: lines, breaks, scatter, predictions."""
 
-from bayesdist.infer.series.compare import (
+from bayesdist.kinds.campaign.series.compare import (
     Comparison,
     FilterDependence,
     Verdict,
@@ -10,7 +10,7 @@ from bayesdist.infer.series.compare import (
     filter_dependence,
     serial_correlation,
 )
-from bayesdist.infer.series.posterior import (
+from bayesdist.kinds.campaign.series.posterior import (
     Change,
     HeldOut,
     Prediction,
@@ -20,7 +20,7 @@ from bayesdist.infer.series.posterior import (
     fit_series,
     held_out,
 )
-from bayesdist.infer.series.series import KINDS, Design, Series, TrendModel
+from bayesdist.kinds.campaign.series.series import KINDS, Design, Series, TrendModel
 
 __all__ = [
     "KINDS",

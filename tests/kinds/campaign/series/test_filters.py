@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bayesdist.errors import DegenerateError, InputError
-from bayesdist.infer.series import Change, TrendModel, filter_dependence, fit_series
+from bayesdist.kinds.campaign.series import Change, TrendModel, filter_dependence, fit_series
 from tests.reduced import only_in_full
 
 from .campaign import LINES, campaign

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from bayesdist.infer.kernel import shear
-from bayesdist.infer.series.sampler import (
+from bayesdist.kinds.campaign.series.sampler import (
     NU,
     PRIOR_SCALE,
     draw_scales,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bayesdist.errors import DegenerateError, InputError
-from bayesdist.infer.series import Series
+from bayesdist.kinds.campaign.series import Series
 
 EPOCH = np.array([2003.0, 2004.0, 2005.0, 2006.0])
 VALUES = np.array([[1.0, 5.0], [2.0, 4.0], [3.0, 7.0], [5.0, 5.0]])
