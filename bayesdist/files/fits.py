@@ -15,6 +15,8 @@ from bayesdist.files.budget import Budget
 FITS_START = b"SIMPLE  ="
 HDU_STARTS = (FITS_START, b"XTENSION=")
 RECORD = 2880  # bytes
+CARD_LENGTH = 80  # characters of a FITS card
+LDAC_IMAGE = "LDAC_IMHEAD"  # extension of a FITS_LDAC catalogue with the header of an image
 
 
 def open_fits(raw: bytes, budget: Budget) -> fits.HDUList:
@@ -154,3 +156,16 @@ def data_size(header: fits.Header) -> int | None:
 def padded(n: int) -> int:
     """Size in bytes, rounded up to complete records."""
     return -(-n // RECORD) * RECORD
+
+
+def ldac_image_header(hdu: fits.BinTableHDU) -> fits.Header:
+    """Image header stored as text in an LDAC_IMHEAD, either one string or one per card.
+
+    Strings of a FITS table lose trailing blanks when they are read, so they are padded to complete
+    cards.
+    """
+    if hdu.data is None or not len(hdu.data):
+        return fits.Header()
+    texts = [str(text) for text in np.ravel(hdu.data.field(0))]
+    filled = (text.ljust(-len(text) % CARD_LENGTH + len(text)) for text in texts)
+    return fits.Header.fromstring("".join(filled))

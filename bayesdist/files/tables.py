@@ -29,7 +29,13 @@ from astropy.utils.xml.iterparser import get_xml_iterator
 from bayesdist.errors import FormatError, InputError
 from bayesdist.files.budget import DAMAGED, LIMITS, Budget, Limits
 from bayesdist.files.faults import naming_faults
-from bayesdist.files.fits import FITS_START, open_fits, refuse_long_arrays
+from bayesdist.files.fits import (
+    FITS_START,
+    LDAC_IMAGE,
+    ldac_image_header,
+    open_fits,
+    refuse_long_arrays,
+)
 from bayesdist.files.parquet import parquet_table
 from bayesdist.files.regular import head_of
 from bayesdist.files.text_tables import (
@@ -51,7 +57,6 @@ from bayesdist.files.text_tables import (
 from bayesdist.files.unpacked import read_lines, read_unpacked, without_codec
 from bayesdist.utils.text import number_of
 
-CARD_LENGTH = 80  # characters of a FITS card
 _COMMAS = re.compile(r"# delimiter: ['\"]?,")
 # cells for missing numbers; astropy would treat any other text that is not a number as missing, too
 _NO_NUMBER = {"", "null"}
@@ -214,7 +219,7 @@ def _ldac(hdus: fits.HDUList, objects: list[fits.BinTableHDU]) -> Table:
     are stored in a column.
     """
     tables = [Table.read(hdu, format="fits", mask_invalid=False) for hdu in objects]
-    images = [_image_header(hdu) for hdu in hdus if hdu.name == "LDAC_IMHEAD"]
+    images = [ldac_image_header(hdu) for hdu in hdus if hdu.name == LDAC_IMAGE]
     for number, table in enumerate(tables, 1):
         if len(tables) > 1 and "EXT_NUMBER" not in table.colnames:
             table["EXT_NUMBER"] = number
@@ -231,19 +236,6 @@ def _ldac(hdus: fits.HDUList, objects: list[fits.BinTableHDU]) -> Table:
     out = vstack(tables, metadata_conflicts="silent") if len(tables) > 1 else tables[0]
     out.meta.update(dates)
     return out
-
-
-def _image_header(hdu: fits.BinTableHDU) -> fits.Header:
-    """Image header stored as text in an LDAC_IMHEAD, either one string or one per card.
-
-    Strings of a FITS table lose trailing blanks when they are read, so they are padded to complete
-    cards.
-    """
-    if hdu.data is None or not len(hdu.data):
-        return fits.Header()
-    texts = [str(text) for text in np.ravel(hdu.data.field(0))]
-    filled = (text.ljust(-len(text) % CARD_LENGTH + len(text)) for text in texts)
-    return fits.Header.fromstring("".join(filled))
 
 
 TABLE_SUFFIXES: dict[str, Callable[[Path, Limits], Table]] = {

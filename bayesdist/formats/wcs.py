@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bayesdist.errors import InputError
 from bayesdist.products.common.cards import holds_wcs
 from bayesdist.products.common.celestial import (
     HELD_PROJECTIONS,
@@ -21,11 +22,18 @@ def _parse(content: Content) -> Content | None:
 
 
 def _refuse(content: Content, name: str) -> None:
-    """Raise the InputError that names an unsupported projection."""
-    for hdu in content.hdus:
-        code = projection_code(hdu.header)
+    """Raise the InputError that names an unsupported projection, or a WCS without distortion."""
+    codes = [projection_code(hdu.header) for hdu in content.hdus]
+    for code in codes:
         if code and code not in HELD_PROJECTIONS:
             refuse_projection(code, name)
+    if any(codes):
+        raise InputError(
+            "is a WCS without distortion",
+            where=name,
+            do="sample it through astropy.wcs: `bayesdist convert FILE --sample --to sip` writes a "
+            "header of another form with the same positions",
+        )
 
 
 FORMAT = Format(

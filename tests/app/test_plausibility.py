@@ -10,9 +10,10 @@ from astropy.table import Table
 from astropy.wcs import WCS
 from numpy.polynomial import legendre
 
+import bayesdist as bd
 from bayesdist.app.config import parse_config
 from bayesdist.app.kinds.plausibility import doubts_on_stars, refuse_empty_segments
-from bayesdist.data import Matches, read_matches
+from bayesdist.data import Matches, read_matches, write_partitioned
 from bayesdist.errors import ConfigError, InputError
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 
@@ -96,7 +97,8 @@ def test_positions_that_were_computed_are_refused_with_a_way_out(rng, noise):
         doubts(found)
     assert "bayesdist.fit_linear" in str(caught.value)
     written = replace(found, u=found.u.round(6), v=found.v.round(6))
-    assert any("computed from the pixels by a WCS" in text for text in doubts(written))
+    with pytest.raises(InputError, match="computed from the pixels by a WCS"):
+        doubts(written)
 
 
 # -- too few stars ---------------------------------------------------------------------------------
@@ -121,8 +123,85 @@ def test_positions_that_a_wcs_made_from_the_pixels_are_named(rng, decimals, name
     ra, dec = wcs.all_pix2world(x, y, 1)
     table = Table({"x": x, "y": y, "ra": np.round(ra, decimals), "dec": np.round(dec, decimals)})
     table["mag"] = 12 + x / 100
-    texts = doubts(read_matches(table, sigma=0.05 if quoted else "by_magnitude"))
-    assert any("computed from the pixels by a WCS" in text for text in texts) == named
+    stars = read_matches(table, sigma=0.05 if quoted else "by_magnitude")
+    if not named:
+        assert not any("computed from the pixels" in text for text in doubts(stars))
+        return
+    with pytest.raises(InputError, match=r"computed from the pixels by a WCS.*'bayesdist convert"):
+        doubts(stars)
+
+
+def test_a_scatter_that_a_mask_may_have_is_only_doubted_without_quoted_errors(rng):
+    """Of 0.0004 px, with no errors to compare it with."""
+    found = stars(rng, sigma=1e-4)
+    noise = rng.normal(0, 4e-4, (2, 200))
+    found = replace(found, u=found.x + noise[0], v=found.y + noise[1], sigma_u=None, sigma_v=None)
+    found = replace(found, mag=12 + found.x / 100)
+    assert any("probably computed from the pixels by a WCS" in text for text in doubts(found))
+
+
+def sip(rng, order, n, chips=1, exposures=1):
+    """Positions by SIP polynomials of one order, without noise; each exposure has a WCS."""
+    parts = []
+    for exposure, chip in np.ndindex(exposures, chips):
+        x, y = rng.uniform(1, 1000, n), rng.uniform(1, 800, n)
+        X, Y = (x - 500.5) / 500, (y - 400.5) / 400
+        roll, tops = 0.1 * exposure, np.array([X**order, Y**order])
+        turn = np.array([[np.cos(roll), -np.sin(roll)], [np.sin(roll), np.cos(roll)]])
+        bent = np.array([x + 1100 * chip, y]) + (1 + chip) * tops
+        parts.append(np.vstack([x, y, turn @ bent, np.full((2, n), 0.02), [[chip + 1] * n]]))
+    x, y, u, v, sigma_u, sigma_v, chip = np.concatenate(parts, axis=1)
+    names = tuple(f"e{k}" for k in range(exposures))
+    return Matches(
+        x=x, y=y, u=u, v=v, sigma_u=sigma_u, sigma_v=sigma_v, chip=chip.astype(int) - 1,
+        chip_numbers=tuple(range(1, chips + 1)), unit="pix",
+        exposure=np.repeat(np.arange(exposures), chips * n), exposure_names=names,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("order", "n", "chips", "exposures"),
+    [(1, 15, 1, 1), (2, 40, 2, 1), (1, 13, 1, 9), (4, 70, 3, 4), (7, 300, 2, 2), (9, 250, 1, 1)],
+)
+def test_computed_positions_are_found_with_few_stars_many_chips_and_high_orders(
+    rng, order, n, chips, exposures
+):
+    found = sip(rng, order, n, chips, exposures)
+    for decimals in (12, 4):
+        written = replace(found, u=found.u.round(decimals), v=found.v.round(decimals))
+        with pytest.raises(InputError, match="computed from the pixels by a WCS"):
+            doubts(written)
+    noise = rng.normal(0, 0.01, (2, len(found)))
+    measured = replace(found, u=found.u + noise[0], v=found.v + noise[1])
+    assert not any("computed from the pixels" in text for text in doubts(measured))
+
+
+def test_rounded_positions_far_below_the_quoted_errors_are_named(rng):
+    """Seven decimals of a right ascension are 0.003 px of 0.03 arcsec."""
+    found = sip(rng, 1, 200)
+    for sigma, named in ((0.05, True), (0.01, False)):
+        quoted = np.full(200, sigma)
+        rounded = replace(
+            found,
+            u=found.u + rng.uniform(-5e-3, 5e-3, 200),
+            v=found.v + rng.uniform(-5e-3, 5e-3, 200),
+            sigma_u=quoted,
+            sigma_v=quoted,
+        )
+        texts = doubts(rounded)
+        assert any("probably computed from the pixels by a WCS" in t for t in texts) == named
+
+
+def test_computed_positions_are_refused_in_python_and_on_disk(rng, tmp_path):
+    found = sip(rng, 2, 200)
+    with pytest.raises(InputError, match="computed from the pixels by a WCS"):
+        bd.calibrate(found, order=2, size=(1000, 800))
+    write_partitioned([found], tmp_path / "stars")
+    with pytest.raises(InputError, match="computed from the pixels by a WCS"):
+        bd.calibrate(tmp_path / "stars", order=2, size=(1000, 800), scale_mas=50.0)
+    # the way out of a design
+    fit = bd.fit_linear(found.with_errors(1.0), bd.build_model(found, order=2, size=(1000, 800)))
+    assert fit.rms_u < 1e-9
 
 
 def test_small_errors_that_are_quoted_are_believed(rng):
@@ -160,7 +239,7 @@ def job(folder, rng, hours=False, scale_mas=None, stretch=1.0):
     c, s = 0.15 / 3600 * np.cos(np.radians(30)), 0.15 / 3600 * np.sin(np.radians(30))
     plane.wcs.crpix, plane.wcs.cd = [500.5, 400.5], [[-c * stretch, s], [s * stretch, c]]
     ra, dec = plane.all_pix2world(x, y, 1)
-    dx, dy = rng.normal(0, 1e-4, (2, 200))  # pixels: measured, if by a very good camera
+    dx, dy = rng.normal(0, 4e-3, (2, 200))  # pixels: measured, if by a very good camera
     table = Table({"x": x + dx, "y": y + dy, "ra": ra / 15 if hours else ra, "dec": dec})
     detector = {"name": "A", "size": (1000, 800)}
     detector |= {} if scale_mas is None else {"scale_mas": scale_mas}

@@ -91,3 +91,65 @@ def test_options_that_a_sampled_header_has_no_use_for_are_refused(tmp_path, opti
     header_of("ARC").totextfile(path, endcard=True)
     found = cli("convert", path, "--sample", "--to", "sip", "-o", tmp_path, *option)
     assert found.code == 1 and option[0] in found.err and "leave it out" in found.err
+
+
+# -- headers of images whose catalogues have positions made from the pixels ------------------------
+
+
+def ldac(path, headers):
+    """A FITS_LDAC catalogue, as SExtractor writes the headers of its images."""
+    hdus = [fits.PrimaryHDU()]
+    for header in headers:
+        text = np.array([[card.image.encode() for card in header.cards] + [b"END".ljust(80)]])
+        column = fits.Column(
+            "Field Header Card", f"{80 * text.size}A", dim=f"(80, {text.size})", array=text
+        )
+        hdus.append(fits.BinTableHDU.from_columns([column], name="LDAC_IMHEAD"))
+        objects = [fits.Column("X_IMAGE", "D", array=np.arange(3.0))]
+        hdus.append(fits.BinTableHDU.from_columns(objects, name="LDAC_OBJECTS"))
+    fits.HDUList(hdus).writeto(path)
+    return path
+
+
+def tpv_header(offset=0.0):
+    header = header_of("TPV")
+    header["CRPIX1"] -= offset
+    for axis in (1, 2):
+        for k, value in {0: 0.0, 1: 1.0, 2: 0.0, 4: 0.02, 5: 0.03, 7: 0.4, 9: -0.3}.items():
+            header[f"PV{axis}_{k}"] = value
+    return fits.PrimaryHDU(np.zeros(SIZE[::-1], "u1"), header).header
+
+
+@pytest.mark.parametrize("to", ["sip", "tpv"])
+def test_headers_of_images_in_a_catalogue_of_sextractor_are_converted(tmp_path, to):
+    headers = [tpv_header(), tpv_header(offset=650.0)]
+    path = ldac(tmp_path / "chips.cat", headers)
+    said = good("inspect", path).out
+    assert "TPV of order 3" in said
+    options = ("--chip", 2) if to == "sip" else ()
+    good("convert", path, "--to", to, "-o", tmp_path / "new.head", *options)
+    text = (tmp_path / "new.head").read_text()
+    written = [
+        fits.Header.fromstring(part, sep="\n") for part in text.split("\nEND") if "CRVAL1" in part
+    ]
+    x, y = np.random.default_rng(1).uniform(1, 400, (2, 50))
+    for old, new in zip(headers[-len(written) :], written, strict=True):
+        expected = pixel_to_skycoord(x, y, WCS(old), origin=1)
+        found = pixel_to_skycoord(x, y, WCS(new), origin=1)
+        assert expected.separation(found).arcsec.max() < 1e-5 * 3600 * STEP
+
+
+def test_a_wcs_without_distortion_is_named_as_one_and_can_be_sampled(tmp_path):
+    header = header_of("TAN")
+    path = tmp_path / "image.fits"
+    fits.PrimaryHDU(np.zeros(SIZE[::-1], "f4"), header).writeto(path)
+    refused = cli("convert", path, "--to", "sip", "-o", tmp_path)
+    assert refused.code == 1
+    assert "is a WCS without distortion" in refused.err and "convert FILE --sample" in refused.err
+    good("convert", path, "--sample", "--to", "sip", "-o", tmp_path / "new.hdr")
+    written = WCS(fits.Header.fromtextfile(tmp_path / "new.hdr"))
+    x, y = np.random.default_rng(1).uniform(1, 400, (2, 50))
+    off = pixel_to_skycoord(x, y, WCS(header), origin=1).separation(
+        pixel_to_skycoord(x, y, written, origin=1)
+    )
+    assert off.arcsec.max() < 1e-5 * 3600 * STEP

@@ -21,9 +21,15 @@ SMALLEST_ERROR = 1e-6  # pixels: smaller errors are impossible
 FEWEST = 10  # fewest stars that determine a scale
 HALF_TURN = 180.0  # degrees: largest plausible extent of u and v
 IN_DEGREES = {"deg": 1.0, "arcsec": 1 / 3600, "mas": 1 / 3.6e6}
-MADE_FROM_PIXELS = 1e-3  # pixels: smaller scatter means that positions were computed from pixels
-FAR_BELOW = 0.1  # such a scatter is also below this fraction of the quoted errors
+# Positions that were computed from pixels scatter less than these sizes, in pixels.  Decimals of a
+# table are a part of the scatter: 7 of a right ascension in degrees are 0.001 px of 0.1 arcsec.
+MADE_FROM_PIXELS = 1e-3
+ROUNDED_POSITIONS = 1e-2  # only if errors are quoted, with a warning
+CERTAINLY_MADE = 1e-4  # if no errors are quoted
+FAR_BELOW = 0.1  # and less than this fraction of the quoted errors
 ORDER = 4
+OTHER_ORDERS = (1, 2, 9)  # orders for few stars, and for headers of high order
+STARS_OF_OTHER_ORDERS = 600  # to which these are fitted
 # rounds of rejection in estimates of the scatter, and in comparisons of orders
 ROUNDS, ORDER_ROUNDS = 20, 6
 NORMAL = 1.4826022185056018  # 1 / (median of |z|, z standard normal)
@@ -127,30 +133,57 @@ def _doubts_on_errors(stars: Matches, scale: float) -> Iterator[str]:
 
 
 def _doubts_on_scatter(stars: Matches, scale: float) -> Iterator[str]:
-    """Sentence about reference positions that are a function of the pixels."""
-    scatter = scatter_about_polynomials(stars)
-    if scatter is None:
+    """Sentence about reference positions that may be a function of the pixels.
+
+    Raises InputError if they are: if their scatter is far below the quoted errors or, without
+    quoted errors, below that of any detector.
+    """
+    scatter = _smallest_scatter(stars)
+    if scatter is None or _on_a_line(stars):  # the fit refuses stars on a line
         return
-    in_pixels = scatter / scale
-    if in_pixels < NOISE_FREE and not _on_a_line(stars):  # the fit refuses such stars
-        raise InputError(
-            f"the reference positions follow a polynomial of the pixels to {in_pixels:.1g} px: "
-            "they were computed from the pixels by a WCS, or are those of a design, and without "
-            "the noise of measured positions there are no errors to find",
-            where=", ".join(stars.sources),
-            do="match detections with a catalogue of their own; a design becomes a calibration "
-            "without errors by bayesdist.fit_linear in Python, and a header by 'bayesdist convert'",
-        )
-    quoted = np.inf
+    in_pixels = float(f"{scatter / scale:.2g}")
+    certain, doubtful = CERTAINLY_MADE, MADE_FROM_PIXELS
     if stars.has_sigma:
         sigma = np.minimum(stars.column("sigma_u"), stars.column("sigma_v"))
-        quoted = float(np.median(sigma)) / scale
-    if in_pixels < min(MADE_FROM_PIXELS, FAR_BELOW * quoted):
-        yield (
+        far_below = FAR_BELOW * float(np.median(sigma)) / scale
+        certain = max(NOISE_FREE, min(MADE_FROM_PIXELS, far_below))
+        doubtful = min(ROUNDED_POSITIONS, far_below)
+    if in_pixels < certain:
+        raise InputError(
             f"the reference positions follow a polynomial of the pixels to {in_pixels:.1g} px, "
-            "which no detector reaches: they were probably computed from the pixels by a WCS, and "
-            "a fit only gives back that WCS; match the detections with a catalogue of their own"
+            "which no detector reaches: they were computed from the pixels by a WCS, or are those "
+            "of a design, and without the noise of measured positions there are no errors to find",
+            where=", ".join(stars.sources),
+            do="match the detections with a catalogue; the WCS of the image becomes a header of "
+            "another form by 'bayesdist convert IMAGE.fits --to sip', and a design a calibration "
+            "without errors by bayesdist.fit_linear in Python",
         )
+    if in_pixels < doubtful:
+        yield (
+            f"the reference positions follow a polynomial of the pixels to {in_pixels:.1g} px, far "
+            "better than detectors measure: they were probably computed from the pixels by a WCS, "
+            "and a fit only gives back that WCS; match the detections with a catalogue"
+        )
+
+
+def _smallest_scatter(stars: Matches) -> float | None:
+    """Smallest scatter about polynomials of several orders, on the axis where it is larger.
+
+    It is the scatter of all stars about a polynomial of order `ORDER` for each chip and exposure,
+    or that of the chip and exposure with the most stars about another order.  None for too few
+    stars.
+    """
+    groups = stars.exposure * len(stars.chip_numbers) + stars.chip
+    rows = np.flatnonzero(groups == np.argmax(np.bincount(groups)))
+    rows = rows[:: -(-len(rows) // STARS_OF_OTHER_ORDERS)]
+    pooled = _residuals_of_groups(stars)
+    residuals = [] if pooled is None else [pooled]
+    residuals += [
+        _clipped_residuals(stars, rows, order, ORDER_ROUNDS)
+        for order in OTHER_ORDERS
+        if EACH * n_terms(order) <= len(rows) and (order > ORDER or pooled is None)
+    ]
+    return min((max(_robust(axis) for axis in each.T) for each in residuals), default=None)
 
 
 def _on_a_line(stars: Matches) -> bool:
@@ -223,14 +256,18 @@ def scatter_about_polynomials(table: Matches) -> float | None:
 
     It is in the unit of u, v; None if there are too few stars.
     """
+    residuals = _residuals_of_groups(table)
+    return None if residuals is None else float(f"{_robust(residuals):.2g}")
+
+
+def _residuals_of_groups(table: Matches) -> Float | None:
+    """Residuals (M, 2) about a polynomial for each chip and exposure; None for too few stars."""
     groups = table.exposure * len(table.chip_numbers) + table.chip
     residuals = [
         _clipped_residuals(table, np.flatnonzero(groups == group), ORDER, ROUNDS)
         for group in np.flatnonzero(np.bincount(groups) >= EACH * n_terms(ORDER))
     ]
-    if not residuals:
-        return None
-    return float(f"{_robust(np.concatenate(residuals)):.2g}")
+    return np.concatenate(residuals) if residuals else None
 
 
 def _scatter_about(table: Matches, rows: Int, order: int) -> float:
@@ -243,7 +280,7 @@ def _robust(residuals: Float) -> float:
 
 
 def _clipped_residuals(table: Matches, rows: Int, order: int, rounds: int) -> Float:
-    """Residuals (2 M,) of rows within `CLIP` of a polynomial fitted to these rows."""
+    """Residuals (M, 2) of rows within `CLIP` of a polynomial fitted to these rows."""
     i, j = np.array(polynomial_terms(order)).T
     X, Y = (2 * (z - z.min()) / max(np.ptp(z), 1.0) - 1 for z in (table.x[rows], table.y[rows]))
     basis = legendre.legvander(X, order)[:, i] * legendre.legvander(Y, order)[:, j]
@@ -257,4 +294,4 @@ def _clipped_residuals(table: Matches, rows: Int, order: int, rounds: int) -> Fl
             break
         used = inliers
     # corrected for the degrees of freedom of the fit
-    return np.asarray(residuals[used].ravel() * np.sqrt(used.sum() / (used.sum() - len(i))))
+    return np.asarray(residuals[used] * np.sqrt(used.sum() / (used.sum() - len(i))))

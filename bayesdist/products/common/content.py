@@ -16,7 +16,7 @@ import warnings
 from codecs import BOM_UTF8
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -29,9 +29,12 @@ from bayesdist.files.atomic import atomic_path
 from bayesdist.files.budget import Budget
 from bayesdist.files.faults import reason_of
 from bayesdist.files.fits import (
+    CARD_LENGTH,
     HDU_STARTS,
+    LDAC_IMAGE,
     RECORD,
     data_size,
+    ldac_image_header,
     open_fits,
     padded,
     refuse_long_arrays,
@@ -42,6 +45,7 @@ from bayesdist.files.unpacked import read_unpacked
 from bayesdist.products.common.cards import card_images, header_of
 from bayesdist.utils.arrays import Float
 
+_FIRST_CARDS = ("SIMPLE  ", "XTENSION")
 _CARD = re.compile(r"[A-Z0-9_-]{1,8} *=|(COMMENT|HISTORY| {8})")
 
 
@@ -238,9 +242,32 @@ def readable(where: str) -> Iterator[None]:
 
 
 def read_content(path: str | os.PathLike[str]) -> Content:
-    """Read and decompress a file; raises the errors of `read_unpacked`."""
+    """Read and decompress a file; raises the errors of `read_unpacked`.
+
+    The content of a FITS_LDAC catalogue is the headers of its images, without its objects.
+    """
     raw, budget = read_unpacked(path)
-    return Content(str(path), raw, Path(path), budget.size)
+    content = Content(str(path), raw, Path(path), budget.size)
+    if content.is_fits and LDAC_IMAGE.encode() in raw:
+        headers = _headers_of_images(content)
+        return replace(content, raw=headers) if headers else content
+    return content
+
+
+def _headers_of_images(catalogue: Content) -> bytes:
+    """Headers of the images of a FITS_LDAC catalogue, as HDUs without data; empty without any."""
+    out = b""
+    for hdu in catalogue.hdus:
+        if hdu.name != LDAC_IMAGE:
+            continue
+        with readable(catalogue.name):
+            header = ldac_image_header(fits.BinTableHDU.fromstring(hdu.to_bytes()))
+        start = "XTENSION= 'IMAGE   '" if out else "SIMPLE  =                    T"
+        cards = [card for card in card_images(header) if card[:8] not in _FIRST_CARDS]
+        lines = [line.ljust(CARD_LENGTH) for line in (start, *cards, "END")]
+        head = "".join(lines).encode("latin-1")
+        out += head.ljust(padded(len(head)), b" ")
+    return out
 
 
 def read_hdus(path: str | os.PathLike[str]) -> tuple[Hdu, ...]:
