@@ -193,7 +193,7 @@ def test_a_table_is_read_by_the_options_of_settings():
     """Motions of 1 arcsec in ten years move stars by as much."""
     rng = np.random.default_rng(1)
     x, y = rng.uniform(1.0, 799.0, (2, 300))
-    dx, dy = rng.normal(0, 1e-4, (2, 300))
+    dx, dy = rng.normal(0, 0.02, (2, 300))
     table = QTable({"x": x + dx, "y": y + dy, "ra": 30.0 + x / 18000.0, "dec": y / 18000.0})
     table["pmra"], table["pmdec"] = np.full(300, 100.0) * u.mas / u.yr, np.zeros(300) * u.mas / u.yr
     table["ra_error"] = table["dec_error"] = np.full(300, 20.0) * u.mas
