@@ -284,6 +284,17 @@ class ParameterLayout:
         return (*free, *self._own_names)
 
     @property
+    def chip_of_global(self) -> Int | None:
+        """Chip codes (n_global,) of the global parameters.
+
+        None if there is one chip, or if some of the parameters are those of a frame.
+        """
+        if len(self.chips) == 1 or self.n_global > self.n_distortion:
+            return None
+        codes = np.arange(len(self.chips), dtype=np.int64)
+        return np.concatenate([np.repeat(codes, 2 * self.n_terms), np.repeat(codes, self.n_tdd)])
+
+    @property
     def n_params(self) -> int:
         """Length of theta."""
         return self.n_global + self.n_frame * (len(self.exposures) - 1 if self.n_frame else 0)

@@ -13,7 +13,7 @@ the approximation is made in
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -168,15 +168,16 @@ def _positive(
     """
     for em in (False, True):
         matrix = _expand(target, split, here.y, at, em=True).matrix if em else here.matrix
+        without_tail = matrix.without_tail()
         try:
-            inner = matrix.without_tail().factor()
+            inner = without_tail.factor()
         except np.linalg.LinAlgError:
             continue
         t, g = matrix.n_tail, matrix.n_global
         if not t:
             return inner, em
         coupling = np.array(
-            [inner.matrix.join(matrix.border[:g, g + k], matrix.edge[:, g + k]) for k in range(t)]
+            [without_tail.join(matrix.border[:g, g + k], matrix.edge[:, g + k]) for k in range(t)]
         )
         explained = coupling @ inner.solve(coupling).T
         unit = np.abs(here.y[-t:]) / 2
@@ -187,7 +188,7 @@ def _positive(
         mended = (vectors * np.maximum(np.abs(values), 1.0)) @ vectors.T / np.outer(unit, unit)
         border = matrix.border.copy()
         border[g:, g:] = mended + explained
-        return Arrow(border, matrix.edge, matrix.blocks, t).factor(), True
+        return replace(matrix, border=border).factor(), True
     raise DegenerateError(
         "the stars with weight do not determine the model",
         where="posterior",
@@ -211,7 +212,7 @@ def _expand(target: Target, split: Split, y: Float, at: Float, *, em: bool = Fal
     tail = np.arange(g, len(free))
     border[tail, tail] += np.maximum(bend, 0.0) if em else bend
     inner = Arrow(
-        border, matrix.edge[:, free] * scale[:, None], matrix.blocks, n_tail=len(off_grid)
+        border, matrix.edge[:, free] * scale[:, None], matrix.blocks, len(off_grid), matrix.parts
     )
     return _Expansion(
         y=y,

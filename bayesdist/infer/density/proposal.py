@@ -172,6 +172,7 @@ class GridProposal:
             "border": np.array([n.factor.matrix.border for n in self.nodes]),
             "edge": np.array([n.factor.matrix.edge for n in self.nodes]),
             "blocks": np.array([n.factor.matrix.blocks for n in self.nodes]),
+            "order": np.array([n.factor.matrix.entries for n in self.nodes]),
         }
 
     @classmethod
@@ -181,8 +182,11 @@ class GridProposal:
         """Restore a proposal from the arrays of `to_arrays`; see `Split` for `n_theta`, `hyper`."""
         split = Split(n_theta, hyper, tuple(hyper[int(k)] for k in arrays["held"]))
         n_tail = len(split.rest)
-        matrices = zip(arrays["border"], arrays["edge"], arrays["blocks"], strict=True)
-        factors = [Arrow(*parts, n_tail=n_tail).factor() for parts in matrices]
+        stored = (arrays[name] for name in ("border", "edge", "blocks", "order"))
+        factors = [
+            Arrow(border, edge, blocks, n_tail, order=order).factor()
+            for border, edge, blocks, order in zip(*stored, strict=True)
+        ]
         values = map(float, arrays["log_marginal"])
         nodes = zip(arrays["at"], arrays["mode"], factors, values, strict=True)
         return cls(split, tuple(Node(*node) for node in nodes))

@@ -3,6 +3,10 @@
 The normal matrix of a model with a frame per exposure has this form, since parameters of different
 exposures are coupled only through the global parameters.  The local blocks are eliminated by the
 Schur complement, so that the cost grows linearly with the number of exposures.
+
+The global parameters of a mosaic are those of its chips, which are coupled only through exposures
+and hyperparameters.  With many chips and few exposures, the chips are the blocks that are
+eliminated, so that memory and cost grow linearly with the number of chips.
 """
 
 from __future__ import annotations
@@ -13,9 +17,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_solve, solve_triangular
+from scipy.linalg import block_diag, cho_solve, solve_triangular
 
 Float = NDArray[Any]  # numpy's stubs lose float64 in its linear algebra
+Int = NDArray[np.int64]
+
+MANY = 100  # global entries; a border with fewer takes little memory and time as a dense matrix
+# largest ratio of the other entries to the global ones for which independent parts are eliminated
+FEW_OTHERS = 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,12 +34,20 @@ class Arrow:
     Vectors are ordered as (global, local blocks, tail).  The border (b, b), with b = n_global +
     n_tail, belongs to the first `n_global` and the last `n_tail` entries, and the blocks
     (n_blocks, q, q) to the entries in between.  The edge (n_blocks, b, q) couples the two.
+
+    `parts` (n_global,) are the numbers, from 0, of the parts that the global entries belong to, for
+    example the chips; None if there is a single part.  Parts of equal size that are not coupled
+    within the border can be eliminated in place of the blocks (see `factor`).  The matrix then has
+    another `order` (size,): the indices in the vector of the entries of the border, followed by
+    those of the blocks.
     """
 
     border: Float
     edge: Float
     blocks: Float
     n_tail: int = 0
+    parts: Int | None = None
+    order: Int | None = None
 
     @property
     def n_global(self) -> int:
@@ -48,14 +65,23 @@ class Arrow:
             self.edge + other.edge,
             self.blocks + other.blocks,
             self.n_tail,
+            other.parts if self.parts is None else self.parts,
         )
 
     @cached_property
-    def _indices(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def _indices(self) -> tuple[Int, Int]:
+        if self.order is not None:
+            border, local = np.split(self.order, [len(self.border)])
+            return border, local
         n, q = self.blocks.shape[:2]
         local = self.n_global + np.arange(n * q)
         tail = self.n_global + n * q + np.arange(self.n_tail)
         return np.concatenate([np.arange(self.n_global), tail]), local
+
+    @property
+    def entries(self) -> Int:
+        """The `order` (size,) of the matrix, also if it is the usual one."""
+        return np.concatenate(self._indices)
 
     def split(self, vector: Float) -> tuple[Float, Float]:
         """Split vectors (..., size) into border part (..., b) and local part (..., n_blocks, q)."""
@@ -81,8 +107,14 @@ class Arrow:
         """Matrix without the rows and columns of the tail."""
         if not self.n_tail:
             return self
-        g = self.n_global
-        return Arrow(self.border[:g, :g], self.edge[:, :g], self.blocks)
+        g, (border, local) = self.n_global, self._indices
+        return Arrow(
+            self.border[:g, :g],
+            self.edge[:, :g],
+            self.blocks,
+            parts=self.parts,
+            order=None if self.order is None else np.concatenate([border[:g], local]),
+        )
 
     def dense(self) -> Float:
         """Full matrix (size, size), for small problems and tests."""
@@ -100,13 +132,40 @@ class Arrow:
     def factor(self) -> ArrowFactor:
         """Cholesky factorisation, with the local blocks eliminated first.
 
-        Raises numpy.linalg.LinAlgError if the matrix is not positive definite.
+        If the global entries have many independent `parts` and there are few other entries, the
+        parts are eliminated instead.  Raises numpy.linalg.LinAlgError if the matrix is not positive
+        definite.
         """
+        return self._with_parts_as_blocks()._factor()
+
+    def _with_parts_as_blocks(self) -> Arrow:
+        """Same matrix with the parts of the global entries as blocks, if that is much smaller."""
+        g, (n, q) = self.n_global, self.blocks.shape[:2]
+        m = n * q
+        if self.parts is None or g < MANY or m + self.n_tail > FEW_OTHERS * g:
+            return self
+        if len(set(np.bincount(self.parts))) > 1:
+            return self
+        members = np.argsort(self.parts, kind="stable").reshape(self.parts.max() + 1, -1)
+        blocks = self.border[members[:, :, None], members[:, None, :]]
+        if np.count_nonzero(self.border[:g, :g]) > np.count_nonzero(blocks):
+            return self  # a prior couples the parts
+        border = np.zeros((m + self.n_tail, m + self.n_tail))
+        border[:m, :m] = block_diag(*self.blocks) if n else 0.0
+        border[m:, m:] = self.border[g:, g:]
+        border[:m, m:] = self.edge[:, g:].mT.reshape(m, self.n_tail)
+        border[m:, :m] = border[:m, m:].T
+        edge = np.concatenate([self.edge[:, :g].mT.reshape(m, g), self.border[g:, :g]])
+        of_border, local = self._indices
+        order = np.concatenate([local, of_border[g:], of_border[members].ravel()])
+        return Arrow(border, edge[:, members].swapaxes(0, 1), blocks, self.n_tail, order=order)
+
+    def _factor(self) -> ArrowFactor:
         chol_blocks = np.linalg.cholesky(self.blocks)
         inverse_blocks = np.linalg.inv(chol_blocks)
         # L_e^-1 B_e^T of all blocks, stacked
         half = inverse_blocks @ self.edge.mT
-        rows = half.reshape(-1, len(self.border))
+        rows = half.reshape(half.shape[0] * half.shape[1], len(self.border))
         chol_border = np.linalg.cholesky(self.border - rows.T @ rows)
         return ArrowFactor(self, chol_border, chol_blocks, inverse_blocks, inverse_blocks.mT @ half)
 
@@ -115,7 +174,7 @@ class Arrow:
 class ArrowFactor:
     """Cholesky factors of a positive definite `Arrow` H, for solutions, log det and draws."""
 
-    matrix: Arrow
+    matrix: Arrow  # H, with the blocks that are eliminated
     chol_border: Float  # lower Cholesky factor (b, b) of the Schur complement
     chol_blocks: Float  # lower Cholesky factors (n_blocks, q, q) of the blocks
     inverse_blocks: Float  # inverses (n_blocks, q, q) of `chol_blocks`
@@ -125,7 +184,11 @@ class ArrowFactor:
         """Solve H x = right for vectors (..., size)."""
         b, l = self.matrix.split(right)
         b = b - np.einsum("nqb,...nq->...b", self.gain, l)
-        top = cho_solve((self.chol_border, True), b.reshape(-1, b.shape[-1]).T).T.reshape(b.shape)
+        if b.size:  # older versions of scipy refuse empty matrices
+            columns = b.reshape(-1, b.shape[-1]).T
+            top = cho_solve((self.chol_border, True), columns).T.reshape(b.shape)
+        else:
+            top = b
         white = np.einsum("nqr,...nr->...nq", self.inverse_blocks, l)
         low = np.einsum("nrq,...nr->...nq", self.inverse_blocks, white)
         return self.matrix.join(top, low - np.einsum("nqb,...b->...nq", self.gain, top))
@@ -151,7 +214,8 @@ class ArrowFactor:
 
     @cached_property
     def _inverse_border(self) -> Float:
-        return solve_triangular(self.chol_border, np.eye(len(self.chol_border)), lower=True)
+        unit = np.eye(len(self.chol_border))
+        return solve_triangular(self.chol_border, unit, lower=True) if unit.size else unit
 
     def whiten(self, x: Float) -> Float:
         """Transform vectors x (..., size) to z with |z|^2 = x^T H x: the inverse of `colour`."""

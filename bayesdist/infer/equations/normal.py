@@ -97,7 +97,7 @@ class NormalEquations(Sums):
                 edge[np.ix_(at, glob, local)] += of_exposure[:, :n]
                 edge[np.ix_(at, np.r_[tail], local)] += of_exposure[:, m:]
                 blocks[np.ix_(at, local, local)] += of_exposure[:, n:m]
-        return Arrow(border, edge, blocks, n_tail=h), right
+        return Arrow(border, edge, blocks, n_tail=h, parts=model.chip_of_global), right
 
 
 def least_squares(

@@ -40,7 +40,7 @@ from bayesdist.utils.memory import require_memory
 from bayesdist.utils.quantities import takes, whole_number
 
 STEPS_KEPT = 100  # steps per walker assumed for the check of the available memory
-FORMAT = 3  # version of the checkpoint files
+FORMAT = 4  # version of the checkpoint files
 ENGINES = ("emcee", "numba", "numpy", "scipy")  # results may depend on the versions of these
 
 # With a smaller efficiency, or Pareto k closer to its limit, more proposals may still lead to other

@@ -22,6 +22,7 @@ from bayesdist.infer.density.proposal import (
     PiecewiseExponential,
     quality_of,
 )
+from bayesdist.model import Chip, TimeDependence
 from tests.reduced import case_in_full
 
 from ..oracle import JitterOracle
@@ -284,6 +285,32 @@ def test_stored_proposals_are_the_same_bit_for_bit(mixed):
     np.testing.assert_array_equal(again.draw(200, np.random.default_rng(7)), psi)
     psi = psi[np.isfinite(psi).all(axis=1)]
     np.testing.assert_array_equal(again.log_density(psi), proposal.log_density(psi))
+
+
+def test_proposals_of_mosaics_hold_blocks_of_chips_and_follow_the_posterior():
+    chips = tuple(Chip(k, f"c{k}", (1000.0, 800.0), (500.0, 400.0)) for k in range(1, 6))
+    model, matches, _ = simulated(
+        5,
+        1500,
+        order=4,
+        chips=chips,
+        frames="shift",
+        n_exposures=3,
+        time=TimeDependence((("u", 1, 0),), (2020.0,)),
+        epochs=[2019.0, 2020.5, 2022.0],
+        jitter=0.01,
+        fraction=0.05,
+    )
+    target, fit = target_of(model, matches, OutlierMixture())
+    proposal = build_proposal(target, fit)
+    # 15 terms on each axis and a rate; four shifts, and the two hyperparameters off the grid
+    arrays = proposal.to_arrays()
+    assert arrays["blocks"].shape[1:] == (5, 31, 31)
+    assert arrays["border"].shape[1:] == (6, 6)
+    psi, log_weights = log_weights_of(target, proposal, n=500)
+    assert efficiency(log_weights) > 0.8
+    again = GridProposal.from_arrays(target.n_theta, target.mixture.hyper, arrays)
+    np.testing.assert_array_equal(again.draw(500, np.random.default_rng(0)), psi)
 
 
 def density_of(target, split, y, at) -> float:

@@ -8,14 +8,18 @@ import pytest
 from bayesdist.infer.equations.arrow import Arrow
 
 SHAPES = [(5, 0, 0, 0), (5, 2, 0, 0), (4, 0, 3, 2), (4, 2, 5, 3), (3, 1, 1, 6)]  # g, tail, n, q
+# the same for global entries of four parts, which are eliminated as blocks
+PARTED = [(120, 0, 0, 0), (120, 2, 0, 0), (120, 0, 2, 3), (120, 2, 4, 5)]
 
 
-def some_arrow(shape: tuple[int, int, int, int], seed: int = 3) -> Arrow:
-    """Positive definite by diagonal dominance."""
+def some_arrow(shape: tuple[int, int, int, int], seed: int = 3, n_parts: int = 1) -> Arrow:
+    """Positive definite by diagonal dominance; the entries of the parts alternate."""
     g, tail, n, q = shape
     rng = np.random.default_rng(seed)
     b = g + tail
+    parts = np.arange(g) % n_parts
     border = rng.standard_normal((b, b))
+    border[:g, :g] *= parts[:, None] == parts
     blocks = rng.standard_normal((n, q, q))
     edge = 0.5 * rng.standard_normal((n, b, q))
     return Arrow(
@@ -23,12 +27,14 @@ def some_arrow(shape: tuple[int, int, int, int], seed: int = 3) -> Arrow:
         edge,
         blocks + np.swapaxes(blocks, 1, 2) + (6 + 3 * b) * np.eye(q),
         n_tail=tail,
+        parts=parts if n_parts > 1 else None,
     )
 
 
-@pytest.fixture(params=SHAPES, ids=str)
+@pytest.fixture(params=[*((s, 1) for s in SHAPES), *((s, 4) for s in PARTED)], ids=str)
 def arrow(request) -> Arrow:
-    return some_arrow(request.param)
+    shape, n_parts = request.param
+    return some_arrow(shape, n_parts=n_parts)
 
 
 def test_dense_has_the_documented_layout():
@@ -81,6 +87,30 @@ def test_colouring_gives_the_covariance_and_whitening_undoes_it(arrow):
     np.testing.assert_allclose(
         (z**2).sum(1), np.einsum("ni,ij,nj->n", x, arrow.dense(), x), rtol=1e-12
     )
+
+
+@pytest.mark.parametrize("shape", PARTED, ids=str)
+def test_independent_parts_are_factored_one_by_one(shape):
+    arrow = some_arrow(shape, n_parts=4)
+    _, tail, n, q = shape
+    found = arrow.factor().matrix
+    assert found.blocks.shape == (4, 30, 30)
+    assert found.border.shape == (n * q + tail, n * q + tail)
+    np.testing.assert_array_equal(found.dense(), arrow.dense())
+    np.testing.assert_array_equal(found.without_tail().dense(), arrow.without_tail().dense())
+
+
+def test_parts_that_a_prior_couples_or_that_many_blocks_join_are_factored_together():
+    arrow = some_arrow((120, 2, 0, 0), n_parts=4)
+    prior = np.zeros_like(arrow.border)
+    prior[3, 4] = prior[4, 3] = 0.1
+    coupled = arrow + Arrow(prior, arrow.edge, arrow.blocks, n_tail=2)
+    assert len(coupled.factor().matrix.border) == 122
+    np.testing.assert_allclose(
+        coupled.factor().covariance(), np.linalg.inv(coupled.dense()), atol=1e-14
+    )
+    joined = some_arrow((120, 2, 20, 3), n_parts=4)
+    assert joined.factor().matrix.blocks.shape == (20, 3, 3)
 
 
 @pytest.mark.parametrize("where", ["border", "blocks", "schur"])
