@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Protocol
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
 from bayesdist.assess.solution import chip_places
 from bayesdist.calibration.plane import ARCSEC
@@ -117,6 +118,21 @@ class ReportedRun(Protocol):
     @property
     def provenance(self) -> Mapping[str, Any]:
         """Folder, command, start, seed, inputs, versions and stages of the run, if known."""
+
+
+def to_be_drawn(run: ReportedRun) -> ReportedRun:
+    """What the report reads of a run, without its configuration, folder and stars.
+
+    Processes that draw figures receive it: to receive the run they would import all that runs are
+    made with, which takes longer than some figures.
+    """
+    names = [name for name in vars(ReportedRun) if not name.startswith("_")]
+    members = {name: getattr(run, name) for name in names} | {
+        "kind": SimpleNamespace(words=run.kind.words),
+        "errors": SimpleNamespace(by_magnitude=run.errors.by_magnitude),
+        "tables": SimpleNamespace(tables=run.tables.tables),
+    }
+    return cast(ReportedRun, SimpleNamespace(**members))
 
 
 def shown_maps(run: ReportedRun) -> tuple[tuple[UncertaintyMap, UncertaintyMap], ...]:

@@ -13,7 +13,7 @@ from markupsafe import Markup
 from bayesdist.files.atomic import atomic_path
 from bayesdist.report.drawing import Drawing, draw_all
 from bayesdist.report.page import Part, Picture, numbered, parts_of, template
-from bayesdist.report.run import ReportedRun, is_provisional, is_simulated
+from bayesdist.report.run import ReportedRun, is_provisional, is_simulated, to_be_drawn
 from bayesdist.report.sections import REPORT
 from bayesdist.report.sections.run.status import facts_line, verdict
 from bayesdist.report.texttable import moment
@@ -42,7 +42,8 @@ _PRINT_WORDS = (
 
 def draw_report(run: ReportedRun, *, pdf: bool = False, processes: int = 1) -> dict[str, Drawing]:
     """Draw the figures of the report of a run, by name in its order; `pdf`: also as PDF."""
-    return draw_all(REPORT, run, pdf=pdf, processes=processes)
+    drawn = to_be_drawn(run) if processes > 1 else run
+    return draw_all(REPORT, drawn, pdf=pdf, processes=processes)
 
 
 def render_report(run: ReportedRun, drawings: Mapping[str, Drawing]) -> str:

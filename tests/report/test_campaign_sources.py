@@ -12,7 +12,7 @@ from bayesdist.app.artefacts.stars import ErrorLaw
 from bayesdist.data import Matches
 from bayesdist.diagnose.overlap import _at_first_epoch, align, chosen_exposures
 from bayesdist.infer.nodes.residuals import inside_chips
-from bayesdist.kinds.campaign.report.data import _residuals
+from bayesdist.kinds.campaign.report.prepared import _residuals
 from bayesdist.model import Chip, DistortionModel, LookupTable, corrected
 
 SIZE = (1024.0, 512.0)

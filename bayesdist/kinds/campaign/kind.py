@@ -207,7 +207,7 @@ class CampaignKind(RunKind[CampaignConfig, Inputs]):
 
     def report_data(self, run: Run) -> CampaignData:
         """Catalogue, matching, residuals without and with tables, and series."""
-        from bayesdist.kinds.campaign.report.data import data_of_campaign  # needed by one stage
+        from bayesdist.kinds.campaign.report.prepared import data_of_campaign  # needed by one stage
 
         return data_of_campaign(run)
 

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from astropy.table import Table
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 
-from bayesdist.app.run import Run
 from bayesdist.assess.maps import per_axis
 from bayesdist.files.tables import read_ecsv
 from bayesdist.model.grid import outline_pixels
@@ -21,6 +20,9 @@ from bayesdist.report.run import ReportedRun, scale_mas
 from bayesdist.report.texttable import MAX_ROWS, TextTable, further, listing, tabulated
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.numbers import MISSING, count, display_scale, number, percent, with_mas
+
+if TYPE_CHECKING:  # processes that draw need nothing else of a run
+    from bayesdist.app.run import Run
 
 MAX_STARS_DRAWN = 20_000  # more would overlap
 ONE_AXIS = 0.5**0.5  # converts a radius hypot(sigma_u, sigma_v) to an error per axis
