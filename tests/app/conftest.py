@@ -69,4 +69,4 @@ def finished(quick_runs, tmp_path_factory) -> Finished:
 @pytest.fixture
 def no_report(monkeypatch):
     """Runs without the figures, which take seconds and are not the subject here."""
-    monkeypatch.setattr("bayesdist.app.stages.report", lambda results, pdf: [])
+    monkeypatch.setattr("bayesdist.app.stages.report", lambda run, pdf: [])

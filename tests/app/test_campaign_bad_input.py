@@ -614,7 +614,7 @@ def test_resuming_after_a_list_was_removed(resumable):
 @pytest.mark.slow
 @only_in_full("each damage is matched alone, and tests/app/campaign runs to its end")
 def test_a_damaged_campaign_is_calibrated_and_says_so(campaign, monkeypatch):
-    monkeypatch.setattr("bayesdist.app.stages.report", lambda results, pdf: [])
+    monkeypatch.setattr("bayesdist.app.stages.report", lambda run, pdf: [])
     # how linear terms went with time takes longer than all the rest, and is not asked here
     monkeypatch.setattr(
         "bayesdist.kinds.campaign.time_dependence.write_series_tables", lambda *_: None

@@ -29,13 +29,13 @@ SIZE = 0.01  # px: of the pattern, either way along x
 @dataclass(frozen=True)
 class Patterned:
     truth: CampaignTruth
-    results: Run
+    run: Run
 
 
 def run_of(kind: str, folder: Path) -> Iterator[Patterned]:
     truth = KINDS[kind].truth(1)
-    with closing(assessed(truth, folder, 1)) as results:
-        yield Patterned(truth, results)
+    with closing(assessed(truth, folder, 1)) as run:
+        yield Patterned(truth, run)
 
 
 @pytest.fixture(scope="module")
@@ -49,12 +49,12 @@ def plain(tmp_path_factory):
     yield from run_of("campaign_inside", tmp_path_factory.mktemp("plain"))
 
 
-def rows(run: Patterned) -> dict[str, dict]:
-    return {row["name"]: row for row in summary_of(run.results.directory.path)["budget"]}
+def rows(patterned: Patterned) -> dict[str, dict]:
+    return {row["name"]: row for row in summary_of(patterned.run.directory.path)["budget"]}
 
 
 def test_a_pattern_is_measured_and_in_the_budget(patterned):
-    found = summary_of(patterned.results.directory.path)["discrepancy"]["structure"]
+    found = summary_of(patterned.run.directory.path)["discrepancy"]["structure"]
     by_axis = {row["axis"]: row["rms"] for row in found}
     # the polynomials lie along the pixels but for a small rotation
     assert by_axis["u"] == pytest.approx(SIZE, rel=0.4)
@@ -66,8 +66,8 @@ def test_a_pattern_is_measured_and_in_the_budget(patterned):
 
 def test_errors_with_a_pattern_cover(patterned):
     error, stated = (
-        actual_error(patterned.results, patterned.truth),
-        stated_sigma(patterned.results),
+        actual_error(patterned.run, patterned.truth),
+        stated_sigma(patterned.run),
     )
     pull = np.abs(error) / stated
     assert 0.55 < np.mean(pull < 1.0) < 0.9
@@ -75,11 +75,11 @@ def test_errors_with_a_pattern_cover(patterned):
 
 
 def test_draws_are_spread_by_what_the_pattern_does_to_the_fit(patterned):
-    results = patterned.results
-    posterior, n = results.posterior, results.posterior.model.n_distortion
-    more = np.sqrt(np.diag(results.solution.cov)[:n] / np.diag(posterior.cov)[:n])
+    run = patterned.run
+    posterior, n = run.posterior, run.posterior.model.n_distortion
+    more = np.sqrt(np.diag(run.solution.cov)[:n] / np.diag(posterior.cov)[:n])
     assert np.median(more) > 1.02 and more.min() > 0.9
-    table = Table.read(results.directory / "coefficients.ecsv")
+    table = Table.read(run.directory / "coefficients.ecsv")
     assert np.isfinite(table["sd"]).all()
 
 
@@ -93,17 +93,17 @@ def test_where_nothing_is_left_out_errors_are_hardly_wider(plain):
 
 def test_at_the_mode_the_priors_pull_as_hard_as_the_stars(plain):
     """Or the structure would be that of deviations which their priors have shrunk."""
-    results = plain.results
-    likelihood = likelihood_of(results.posterior)
-    sums = results.shards.sum(cell_sums, likelihood, 32)
-    information = Information(results.fit.model, likelihood.theta, sums, results.priors)
+    run = plain.run
+    likelihood = likelihood_of(run.posterior)
+    sums = run.shards.sum(cell_sums, likelihood, 32)
+    information = Information(run.fit.model, likelihood.theta, sums, run.priors)
     of_stars = Information(
-        results.fit.model,
+        run.fit.model,
         likelihood.theta,
         sums,
-        type(results.priors).none(results.fit.model),
+        type(run.priors).none(run.fit.model),
     )
-    D = results.fit.model.n_distortion
+    D = run.fit.model.n_distortion
 
     def distance(score: np.ndarray) -> float:
         """In standard deviations of the posterior, over the deviations of all exposures."""

@@ -113,21 +113,21 @@ def test_what_is_held_out_is_no_part_of_the_fit(run) -> None:
 @only_in_full("test_pipeline has a script that does")
 def test_functions_find_what_the_run_has_found(run) -> None:
     """Lists are matched and fitted without a run's folder, and are prepared as those of the run."""
-    prepared, results = fit(match(in_memory(run / "config.toml"))), Run.of(RunDirectory.open(run))
+    prepared, opened = fit(match(in_memory(run / "config.toml"))), Run.of(RunDirectory.open(run))
     known = load_fit(run / "fit.nc")
     np.testing.assert_array_equal(prepared.fit.mean, known.mean)
     np.testing.assert_array_equal(prepared.fit.cov, known.cov)
     for name in ("x", "u", "sigma_u", "star", "exposure"):
         for made, read in (
-            (prepared.matches, results.matches),
-            (prepared.held_out, results.held_out),
+            (prepared.matches, opened.matches),
+            (prepared.held_out, opened.held_out),
         ):
             np.testing.assert_array_equal(getattr(made, name), getattr(read, name))
-    assert prepared.held_exposures == results.held_exposures
+    assert prepared.held_exposures == opened.held_exposures
     assert len(prepared.held_exposures) == 2
     alone, scatter = prepared.part(ExposuresAlone).series, prepared.part(ExposureScatter)
-    np.testing.assert_array_equal(alone.values, results.part(ExposuresAlone).series.values)
-    np.testing.assert_array_equal(scatter.tau, results.part(ExposureScatter).tau)
+    np.testing.assert_array_equal(alone.values, opened.part(ExposuresAlone).series.values)
+    np.testing.assert_array_equal(scatter.tau, opened.part(ExposureScatter).tau)
 
 
 @pytest.mark.slow
@@ -172,8 +172,8 @@ def test_an_exposure_that_went_wrong_is_named(run, folder, tmp_path, monkeypatch
     for one in run.iterdir():
         if one.is_file():
             shutil.copy(one, tmp_path / "other" / one.name)
-    results = Run.of(RunDirectory.open(tmp_path / "other"))
-    found = diagnose(results).diagnostics.holdout
+    other = Run.of(RunDirectory.open(tmp_path / "other"))
+    found = diagnose(other).diagnostics.holdout
     assert found.level == "fail" and f"exposure {name}, held out whole" in found.verdict
 
 

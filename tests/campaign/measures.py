@@ -112,7 +112,7 @@ def node_errors(found: Calibrated, tables: TableFit, step: float) -> Outcome:
         "rms after": tables.progress[-1].rms,
         "rms noise": _noise(found),
     }
-    pairs = found.results.stars
+    pairs = found.run.stars
     model = found.affine_model
     _, with_errors, _ = fit_by_magnitude(pairs, model)
     binned = fit_with_tables(with_errors, model, method="binned", step=(step, step))
@@ -135,7 +135,7 @@ def node_errors(found: Calibrated, tables: TableFit, step: float) -> Outcome:
 
 def _noise(found: Calibrated) -> float:
     """Rms of the errors of centroids and catalogue, as they were drawn, of all pairs."""
-    pairs = found.results.stars
+    pairs = found.run.stars
     assert pairs.star is not None
     assert pairs.sigma_u is not None and pairs.sigma_v is not None
     single = centroid_error(found.campaign.truth.stars.mag[pairs.star])
@@ -186,7 +186,7 @@ def _position(
     where: dict[str, Any],
 ) -> tuple[np.ndarray, np.ndarray]:
     """Positions (N, 2) and their covariance (N, 2, 2)."""
-    px, py = corrected(found.results.tables.tables, x, y, chip=where["chip"])
+    px, py = corrected(found.run.tables.tables, x, y, chip=where["chip"])
     D = view.model.jacobian(view.mean, px, py, **where)
     J = view.model.slopes(view.mean, px, py, **where)
     table = posterior.position_sigma(x, y, refitted=True) ** 2
@@ -242,7 +242,7 @@ def alignments(found: Calibrated) -> Outcome:
 
 def _calibrations(found: Calibrated) -> dict[str, Callable[..., np.ndarray]]:
     """Positions (N, 2) of x, y, chip and epoch by three calibrations."""
-    truth, tables = found.campaign.truth, found.results.tables.tables
+    truth, tables = found.campaign.truth, found.run.tables.tables
     view = reference_gauge(without_frames(found.joint), REFERENCE)
 
     def new(x: np.ndarray, y: np.ndarray, chip: np.ndarray, epoch: float) -> np.ndarray:

@@ -104,7 +104,7 @@ class Calibrated:
     ----------
     campaign : AcsCampaign
         What it was made from.
-    results : Run
+    run : Run
     tables : TableFit or None
     bare, joint : HierarchicalFit and TransformedSolution
         All exposures jointly; without and with the correlated errors of the catalogue.
@@ -113,7 +113,7 @@ class Calibrated:
     """
 
     campaign: AcsCampaign
-    results: Run
+    run: Run
     tables: TableFit | None
     bare: HierarchicalFit
     joint: TransformedSolution
@@ -122,7 +122,7 @@ class Calibrated:
     @property
     def affine_model(self) -> DistortionModel:
         """Configured polynomial with a free linear part for each exposure."""
-        return affine_model_of(self.results.inputs.config, self.results.stars)
+        return affine_model_of(self.run.inputs.config, self.run.stars)
 
 
 @contextmanager
@@ -136,20 +136,20 @@ def calibrated(setting: Setting, seed: int) -> Iterator[Calibrated]:
         _simulate(setting, seed, base)
         config = base / f"campaign_{FILTER.lower()}.toml"
         settings, text = load_config(config)
-        run = RunDirectory.plan(Path(folder) / "run", settings, text, base)
-        run.begin()
-        with Run.of(run) as results:
-            results = make_stages(results, ("match",))
+        directory = RunDirectory.plan(Path(folder) / "run", settings, text, base)
+        directory.begin()
+        with Run.of(directory) as run:
+            run = make_stages(run, ("match",))
             with _results_of("fit_tables", "fit_hierarchical") as made:
-                results = make_stages(results, ("fit",))
+                run = make_stages(run, ("fit",))
             bare = made["fit_hierarchical"]
             yield Calibrated(
                 campaign=read_acs(base),
-                results=results,
+                run=run,
                 tables=made["fit_tables"][1],
                 bare=bare,
-                joint=_with_catalogue(bare, results),
-                terms=results.parts["alone"].series,
+                joint=_with_catalogue(bare, run),
+                terms=run.parts["alone"].series,
             )
 
 

@@ -40,10 +40,10 @@ def pulls_of(seed: int, folder: Path) -> tuple[dict, np.ndarray]:
     rate = chip_by_chip(drift(rng))
     truth = made(rng, Recipe(chips=TWO, exposures=EXPOSURES, deviations=deviations, rate=rate))
     truth.config["holdout"] = HOLDOUT
-    results = assessed(truth, folder, seed)
+    run = assessed(truth, folder, seed)
     scale, plus, cross = drawn[0][EXPOSURES]
     own = np.linalg.inv([[1 + scale + plus, cross], [cross, 1 + scale - plus]])
-    view = reference_gauge(without_frames(results.solution), results.fit.model.chips[0].number)
+    view = reference_gauge(without_frames(run.solution), run.fit.model.chips[0].number)
     draws = rng.multivariate_normal(view.mean, view.cov, 2000, method="svd")
     frame, out = None, []
     for date in DATES:
@@ -65,7 +65,7 @@ def pulls_of(seed: int, folder: Path) -> tuple[dict, np.ndarray]:
             sigma = found.std(axis=0)
             free = sigma > 1e-9
             out.append(((found.mean(axis=0) - project @ true) / np.where(free, sigma, 1.0))[free])
-    return summary_of(results.directory.path), np.concatenate(out)
+    return summary_of(run.directory.path), np.concatenate(out)
 
 
 def _frame(x, y, w):

@@ -46,6 +46,6 @@ def run(folder, full) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(time_dependence, "_verdict", first)
         if not full:
-            patch.setattr("bayesdist.app.stages.report", lambda results, pdf: [])
+            patch.setattr("bayesdist.app.stages.report", lambda run, pdf: [])
         good("run", folder / "campaign_f606w.toml", "-o", out, "-q")
     return out

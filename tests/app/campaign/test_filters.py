@@ -90,8 +90,8 @@ def release(runs, folder, full):
 # -- what one run takes from the other ------------------------------------------------------------
 
 
-def local_errors(results):
-    return [term for term in results.error_model.terms if isinstance(term, LocalErrors)]
+def local_errors(run):
+    return [term for term in run.error_model.terms if isinstance(term, LocalErrors)]
 
 
 def test_the_detectors_tables_are_held_and_the_filters_are_fitted(by_filter):

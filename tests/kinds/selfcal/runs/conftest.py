@@ -35,7 +35,7 @@ def _finished(folder: Path, rolls: tuple[float, ...], *, report: bool) -> Finish
     config = write_selfcal(folder / "input", list_table(truth), products=PRODUCTS)
     with pytest.MonkeyPatch.context() as patch:
         if not report:
-            patch.setattr("bayesdist.app.stages.report", lambda results, pdf: [])
+            patch.setattr("bayesdist.app.stages.report", lambda run, pdf: [])
         result = good("run", config, "-o", folder / "run")
     return Finished(folder / "run", config, truth, result)
 

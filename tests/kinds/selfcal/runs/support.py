@@ -104,6 +104,6 @@ def fitted(folder: Path, config: Path) -> Run:
     return after_stages(run, "match", "fit", rehearsed=False)
 
 
-def directions(results: Run) -> dict[str, dict[str, Any]]:
+def directions(run: Run) -> dict[str, dict[str, Any]]:
     """What summary.json says of each property of the solution, by name."""
-    return {d["name"]: d for d in results.directory.summary["selfcal"]["gauge"]["directions"]}
+    return {d["name"]: d for d in run.directory.summary["selfcal"]["gauge"]["directions"]}

@@ -52,8 +52,8 @@ def offsets(truth, tmp_path_factory):
 @only_in_full("other references of the scale are run")
 def test_scale_and_rotation_from_offsets(truth, offsets):
     """The errors are those of a regression through the offsets: sigma over their lever arm."""
-    results, table = offsets
-    found = directions(results)
+    run, table = offsets
+    found = directions(run)
     at = np.column_stack([table["du"], table["dv"]])
     lever = np.sqrt(((at - at.mean(axis=0)) ** 2).sum())
     for name in ("scale", "rotation"):
@@ -62,12 +62,12 @@ def test_scale_and_rotation_from_offsets(truth, offsets):
         # the offsets' own errors, a thousandth of them here, move the lever arm
         assert found[name]["sigma_fixed"] == pytest.approx(SIGMA / lever, rel=5e-3)
     assert found["zero_point_u"]["fixed_by"] == "convention"
-    assert results.directory.summary["selfcal"]["gauge"]["held"] == ["u_0_0", "v_0_0"]
+    assert run.directory.summary["selfcal"]["gauge"]["held"] == ["u_0_0", "v_0_0"]
 
 
 def test_offsets_that_contradict_the_detections_are_told(truth, offsets, tmp_path):
-    results, table = offsets
-    assert not results.parts["solved"].contradictions
+    run, table = offsets
+    assert not run.parts["solved"].contradictions
     wrong = table.copy()
     wrong["du"][3] += 8 * SIGMA
     config = write_selfcal(tmp_path, list_table(truth), gauge={"offsets": "offsets.ecsv"})
@@ -86,23 +86,23 @@ def test_an_exposure_whose_offset_stands_twice(truth, offsets, tmp_path):
 
 
 def test_the_error_of_the_configuration_goes_before_that_of_the_table(truth, offsets, tmp_path):
-    results, table = offsets
+    run, table = offsets
     gauge = {"offsets": "offsets.ecsv", "offset_sigma": 3 * SIGMA}
     config = write_selfcal(tmp_path, list_table(truth), gauge=gauge)
     table.write(config.parent / "offsets.ecsv")
-    found, before = directions(fitted(tmp_path / "run", config)), directions(results)
+    found, before = directions(fitted(tmp_path / "run", config)), directions(run)
     ratio = found["scale"]["sigma_fixed"] / before["scale"]["sigma_fixed"]
     assert ratio == pytest.approx(3, rel=0.01)
 
 
 def test_the_scale_is_that_of_the_offsets(truth, offsets):
-    results, _ = offsets
-    sigma = directions(results)["scale"]["sigma_fixed"]
-    assert abs(_pixel(results) - _pixel_of(truth.model, truth.theta)) < 4 * sigma
+    run, _ = offsets
+    sigma = directions(run)["scale"]["sigma_fixed"]
+    assert abs(_pixel(run) - _pixel_of(truth.model, truth.theta)) < 4 * sigma
 
 
-def _pixel(results):
-    return _pixel_of(results.fit.model, results.parts["solved"].mode.theta)
+def _pixel(run):
+    return _pixel_of(run.fit.model, run.parts["solved"].mode.theta)
 
 
 def _pixel_of(model, theta):
@@ -120,11 +120,11 @@ def test_relative_errors_are_the_same_in_every_gauge(free, offsets):
         [
             uncertainty_map(one, grid=(9, 9)).radius
             for one in (
-                gauge_free(results.fit, results.parts["solved"].gauge.null),
-                results.fit,
+                gauge_free(run.fit, run.parts["solved"].gauge.null),
+                run.fit,
             )
         ]
-        for results in (free, offsets[0])
+        for run in (free, offsets[0])
     ]
     relative, absolute = zip(*maps, strict=True)
     # the two solutions differ by a scale and rotation, and their curvature by the jitter found
@@ -151,11 +151,11 @@ def test_the_scale_of_another_detector(truth, tmp_path):
     """The pixel is as large as was said, and as well known."""
     tie = {"mas": 1.001 * SCALE_MAS, "sigma": 3e-5, "detector": "WFC"}
     config = write_selfcal(tmp_path / "input", list_table(truth), gauge={"scale": tie})
-    results = fitted(tmp_path / "run", config)
-    scale = directions(results)["scale"]
+    run = fitted(tmp_path / "run", config)
+    scale = directions(run)["scale"]
     assert scale["fixed_by"] == "scale of WFC"
     assert scale["sigma_fixed"] == pytest.approx(3e-5, rel=1e-6)
-    assert _pixel(results) == pytest.approx(1.001, abs=1e-5)
+    assert _pixel(run) == pytest.approx(1.001, abs=1e-5)
 
 
 def test_rolls(tmp_path):
@@ -164,12 +164,12 @@ def test_rolls(tmp_path):
     gauge = {"offsets": "offsets.ecsv", "roll_sigma_deg": 0.01}
     config = write_selfcal(tmp_path / "input", list_table(truth), gauge=gauge)
     commanded(truth, SIGMA, np.random.default_rng(3)).write(config.parent / "offsets.ecsv")
-    results = fitted(tmp_path / "run", config)
-    found = directions(results)
+    run = fitted(tmp_path / "run", config)
+    found = directions(run)
     assert found["scale"]["fixed_by"] == "commanded offsets"
     # offsets see a skew as they see a scale
     assert found["skew_plus"]["fixed_by"] == "commanded offsets"
-    assert len(results.parts["solved"].gauge.held) == 2
+    assert len(run.parts["solved"].gauge.held) == 2
 
 
 def _references(truth, sigma_mas, n, rng):
@@ -199,32 +199,32 @@ def test_reference_stars(truth, tmp_path):
     rng, sigma = np.random.default_rng(4), 1.0
     table = _references(truth, sigma, 150, rng)
     table.write(config.parent / "reference.ecsv")
-    results = fitted(tmp_path / "run", config)
-    found = directions(results)
+    run = fitted(tmp_path / "run", config)
+    found = directions(run)
     for name in ("zero_point_u", "zero_point_v", "scale", "rotation"):
         assert found[name]["state"] == "free"
         assert found[name]["fixed_by"] == "reference stars"
-    assert not results.directory.summary["selfcal"]["gauge"]["held"]
-    used = results.parts["solved"].mode.problem.priors.informed
+    assert not run.directory.summary["selfcal"]["gauge"]["held"]
+    used = run.parts["solved"].mode.problem.priors.informed
     assert used.sum() > 100
     # the closed form for stars whose own detections have no errors: it is the lower bound
-    at = results.parts["solved"].mode.stars[used]
+    at = run.parts["solved"].mode.stars[used]
     lever = np.sqrt(((at - at.mean(axis=0)) ** 2).sum())
     scale = found["scale"]["sigma_fixed"]
     assert sigma / lever < scale < 2 * sigma / lever
-    stars = star_catalogue(results.parts["solved"].mode)
+    stars = star_catalogue(run.parts["solved"].mode)
     # every star, reference star or not, lies where the catalogue's sky has it
     where = np.column_stack([table["u"], table["v"]]) * 1000
     distance = np.sqrt(((stars.values[used, None] - where) ** 2).sum(axis=2)).min(axis=1)
     # of the catalogue's errors, Rayleigh: 99.9 % within 3.7 sigma
     assert np.quantile(distance, 0.99) < 3.7 * sigma
     true = SCALE_MAS * _pixel_of(truth.model, truth.theta)
-    assert _pixel(results) == pytest.approx(true, rel=4 * scale)
+    assert _pixel(run) == pytest.approx(true, rel=4 * scale)
 
 
 def test_check_tells_what_fixes_the_scale(truth, offsets, tmp_path):
-    results, _ = offsets
-    config = results.base / "config.toml"
+    run, _ = offsets
+    config = run.base / "config.toml"
     out = good("check", config).out
     assert "scale: fixed by commanded offsets, sigma" in out
     assert "2 of them held by convention" in out

@@ -85,9 +85,9 @@ def _calibrated(folder, seed, scatter_deg, n_chips):
     ],
 )
 def test_what_is_held_is_free_in_every_covariance(tmp_path, seed, n_chips, scatter_deg):
-    results, bends = _calibrated(tmp_path, seed, scatter_deg, n_chips)
-    model, gauge, fit = results.fit.model, results.parts["solved"].gauge, results.fit
-    summary = results.directory.summary["selfcal"]["gauge"]
+    run, bends = _calibrated(tmp_path, seed, scatter_deg, n_chips)
+    model, gauge, fit = run.fit.model, run.parts["solved"].gauge, run.fit
+    summary = run.directory.summary["selfcal"]["gauge"]
     without_error = {model.names[k] for k in np.flatnonzero(np.diag(fit.cov) == 0)}
     assert set(summary["held"]) == without_error
     assert len(without_error) == gauge.null.shape[1] == summary["n_free"]

@@ -36,7 +36,7 @@ def run(data_dir, tmp_path_factory):
         sampler={"seed": 1},
     )
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("bayesdist.app.stages.report", lambda results, pdf: [])
+        patch.setattr("bayesdist.app.stages.report", lambda run, pdf: [])
         good("run", config, "-o", folder / "run")
     return folder / "run"
 
@@ -61,13 +61,13 @@ def test_the_distortion_is_that_of_the_observatory(run, data_dir, capsys):
     posterior have more than 0.99 within, one of twenty less than 0.76), and the 14 numbers
     together are the sharper test.
     """
-    results = Run.of(RunDirectory.open(run))
+    opened = Run.of(RunDirectory.open(run))
     columns = read_hst1pass(data_dir / "hst1pass_uvis" / "ie8j01xlq_flt.uvwXYMpq").columns
     x, y, u, v = (np.asarray(columns[name], float) for name in "XYuv")
     nodes = (np.arange(CELLS) + 0.5) * SIDE / CELLS
     rows = np.unique([np.argmin((x - a) ** 2 + (y - b) ** 2) for a in nodes for b in nodes])
     x, y, theirs = x[rows], y[rows], np.column_stack([u, v])[rows]
-    relative = gauge_free(results.solution, results.parts["solved"].gauge.null)
+    relative = gauge_free(opened.solution, opened.parts["solved"].gauge.null)
     model, K = relative.model, relative.model.n_polynomial
     first = np.zeros(len(x), np.int64)
     ours = model.predict(relative.mean, x, y, exposure=first)

@@ -46,10 +46,10 @@ def _grid(n: int = 12) -> tuple[np.ndarray, np.ndarray]:
 def test_the_distortion_is_within_its_errors(name, kind, n_free, request):
     """Chi-square of the coefficients, but for the sky's free maps, which theta's null space has."""
     finished = request.getfixturevalue(name)
-    results = Run.of(RunDirectory.open(finished.path))
-    posterior, gauge = results.posterior, results.parts["solved"].gauge
+    run = Run.of(RunDirectory.open(finished.path))
+    posterior, gauge = run.posterior, run.parts["solved"].gauge
     assert gauge.null.shape[1] == gauge.open.shape[1] == n_free
-    relative = gauge_free(results.solution, gauge.null)
+    relative = gauge_free(run.solution, gauge.null)
     model, truth = posterior.model, finished.truth
     x, y = _grid()
     first = np.zeros(len(x), np.int64)
@@ -92,15 +92,11 @@ def test_functions_find_what_the_run_has_found(one_roll):
     known = load_fit(one_roll.path / "fit.nc")
     np.testing.assert_array_equal(fitted.fit.mean, known.mean)
     np.testing.assert_array_equal(fitted.fit.cov, known.cov)
-    results = Run.of(RunDirectory.open(one_roll.path))
-    np.testing.assert_array_equal(
-        fitted.parts["solved"].mode.stars, results.parts["solved"].mode.stars
-    )
-    np.testing.assert_array_equal(
-        fitted.parts["solved"].gauge.held, results.parts["solved"].gauge.held
-    )
-    assert fitted.parts["solved"].fixed == results.parts["solved"].fixed
-    made, read = fitted.matches, results.matches
+    run = Run.of(RunDirectory.open(one_roll.path))
+    np.testing.assert_array_equal(fitted.parts["solved"].mode.stars, run.parts["solved"].mode.stars)
+    np.testing.assert_array_equal(fitted.parts["solved"].gauge.held, run.parts["solved"].gauge.held)
+    assert fitted.parts["solved"].fixed == run.parts["solved"].fixed
+    made, read = fitted.matches, run.matches
     for name in ("x", "u", "sigma_u", "exposure", "row"):
         np.testing.assert_array_equal(getattr(made, name), getattr(read, name))
     facts, summary = as_json(fitted.fit_facts["selfcal"]), summary_of(one_roll.path)["selfcal"]
@@ -310,8 +306,8 @@ def test_new_matches_on_another_sky_test_the_release(bend, three_rolls, tmp_path
 
 def test_more_exposures_are_planned_as_these_are_dithered(three_rolls):
     """Once more as many exposures halve the variance: as a limit by the root of 2 nearer asks."""
-    results = Run.of(RunDirectory.open(three_rolls.path))
-    mode = results.parts["solved"].mode
+    run = Run.of(RunDirectory.open(three_rolls.path))
+    mode = run.parts["solved"].mode
     n = mode.problem.model.n_distortion
     more = with_information(mode.solution, mode.distortion_information)
     before, after = (np.diag(one.cov)[:n] for one in (mode.solution, more))
@@ -319,7 +315,7 @@ def test_more_exposures_are_planned_as_these_are_dithered(three_rolls):
     assert free.sum() > n / 2
     np.testing.assert_allclose(after[free], before[free] / 2, rtol=1e-6)
     # the draws of a parameter that the gauge fixes are equal: no rounding is taken for a variance
-    drawn = results.posterior
+    drawn = run.posterior
     fixed = np.setdiff1d(np.arange(len(mode.theta)), mode.free)
     assert len(fixed) and not drawn.cov[fixed].any()
     planned = with_information(drawn, mode.distortion_information)
@@ -339,9 +335,9 @@ def test_requirements_are_judged(three_rolls, tmp_path):
 
 def test_residuals_are_about_the_stars_that_were_fitted(three_rolls):
     """The residuals of a star have no mean: about the mean of the draws they would have one."""
-    results = Run.of(RunDirectory.open(three_rolls.path))
-    sample = results.diagnostics.sample
-    problem = results.parts["solved"].mode.problem
+    run = Run.of(RunDirectory.open(three_rolls.path))
+    sample = run.diagnostics.sample
+    problem = run.parts["solved"].mode.problem
     n, star = len(problem.starts) - 1, np.empty(problem.rows.max() + 1, int)
     star[problem.rows] = np.repeat(np.arange(n), np.diff(problem.starts))
     assert set(sample.table.row) == set(problem.rows)
@@ -359,6 +355,6 @@ def test_residuals_are_about_the_stars_that_were_fitted(three_rolls):
         return np.abs(of_stars(weight * residual) / np.sqrt(of_stars(weight)))
 
     assert (~doubted).sum() > 50
-    stars, order = prepare(results.fit.model, results.matches)
-    of_mean = in_table_order(stars.residuals(results.posterior.mean), order)
+    stars, order = prepare(run.fit.model, run.matches)
+    of_mean = in_table_order(stars.residuals(run.posterior.mean), order)
     assert np.median(pull(sample.residual)) < 0.5 * np.median(pull(of_mean))

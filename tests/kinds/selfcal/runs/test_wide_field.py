@@ -38,15 +38,15 @@ def _config(folder, scale_mas, **more):
 def test_tangent_planes_are_taken_to_one_by_the_size_of_a_pixel(tmp_path, scale_mas):
     config = _config(tmp_path, scale_mas)
     told = good("check", config).out
-    results = fitted(tmp_path / "run", config)
-    moved = results.directory.summary["selfcal"]["tangent_planes_pix"]
+    run = fitted(tmp_path / "run", config)
+    moved = run.directory.summary["selfcal"]["tangent_planes_pix"]
     # of a corner, p (p . d) and p d^2 in pixels of so many radians, with the largest offset d
     pointings = observed(SEED)[1]
     first = tangent_plane(*pointings[0], scale=ARCSEC)
     offset, corner = np.hypot(*on(first, pointings).T).max(), N / np.sqrt(2)
     most = corner * offset * (corner + offset) * np.radians(ARCSEC / 3600) ** 2
-    stars = results.placed
-    tests = selfcal_score_tests(results.parts["solved"].mode, mag=stars.mag, epoch=stars.epoch)
+    stars = run.placed
+    tests = selfcal_score_tests(run.parts["solved"].mode, mag=stars.mag, epoch=stars.epoch)
     [test] = [one for one in tests if one.name == "pointing"]
     if scale_mas is None:
         assert "taken as flat" in told
@@ -58,14 +58,14 @@ def test_tangent_planes_are_taken_to_one_by_the_size_of_a_pixel(tmp_path, scale_
         assert most / 4 < moved < most
         assert not test.significant
         # the stars' plane touches the sky in the middle of all pointings, whichever is first
-        at = results.directory.summary["selfcal"]["tangent_plane"]
+        at = run.directory.summary["selfcal"]["tangent_plane"]
         assert at["pixel"] == [MIDDLE, MIDDLE]
-        solution = results.fit
+        solution = run.fit
         middle = solution.model.predict(solution.mean, MIDDLE, MIDDLE, exposure=0)
         [contact] = first.wcs_pix2world([np.array(at["contact"]) - np.ravel(middle)], 1)
         off = on(tangent_plane(*contact, scale=ARCSEC), pointings).mean(axis=0)
         assert np.hypot(*off) < 0.003 * offset
-        assert f"at pixel ({MIDDLE:g}, {MIDDLE:g}) of chip" in results.gauge_words
+        assert f"at pixel ({MIDDLE:g}, {MIDDLE:g}) of chip" in run.gauge_words
         # what the stages after the match read
-        raw, kept = results.inputs.detections, results.part(FirstSolution).detections
+        raw, kept = run.inputs.detections, run.part(FirstSolution).detections
         assert np.hypot(kept.x - raw.x, kept.y - raw.y).max() == pytest.approx(moved)
