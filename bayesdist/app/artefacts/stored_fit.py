@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Required, TypedDict
 
 from astropy.table import Table
 
@@ -14,7 +14,15 @@ from bayesdist.app.store.output import write_table
 from bayesdist.errors import InputError
 from bayesdist.files.faults import restoring
 from bayesdist.files.records import read_record, write_record
-from bayesdist.infer import LinearFit, Posterior, load_fit, load_posterior, save_fit
+from bayesdist.infer import (
+    GaussianPriors,
+    LinearFit,
+    Posterior,
+    load_fit,
+    load_posterior,
+    save_fit,
+)
+from bayesdist.infer.catalogue.added_errors import GroupedErrors
 
 FIT, RECORD, MAGNITUDE_ERRORS = "fit.nc", "fit.h5", "magnitude_errors.ecsv"
 # artefacts of the stage 'fit' by their names in fit.h5, which holds parts as well
@@ -25,6 +33,17 @@ RECORDED = {
     "facts": "fit_facts",
 }
 FIT_AGAIN = "run the stage 'fit' again"
+
+
+class FitArtefacts(TypedDict, total=False):
+    """Artefacts of the stage 'fit' by their names; see the members of `bayesdist.Run`."""
+
+    fit: Required[LinearFit]
+    errors: ErrorLaw
+    priors: GaussianPriors
+    added_errors: GroupedErrors | None
+    parts: Mapping[str, Part]
+    fit_facts: Mapping[str, Any]
 
 
 def write_stored_fit(
@@ -46,11 +65,17 @@ def write_stored_fit(
         part.save(folder)
 
 
-def read_stored_fit(folder: Path) -> dict[str, Any]:
-    """Artefacts of the stage 'fit' by name, with the parts of fit.h5."""
+def read_stored_fit(folder: Path) -> FitArtefacts:
+    """Artefacts of the stage 'fit', with the parts of fit.h5."""
     record = _read_record(folder)
-    artefacts = {name: record[key] for key, name in RECORDED.items()}
-    return {"fit": load_fit(folder / FIT), **artefacts, "parts": record["parts"]}
+    return {
+        "fit": load_fit(folder / FIT),
+        "errors": record["errors"],
+        "priors": record["priors"],
+        "added_errors": record["grouped"],
+        "fit_facts": record["facts"],
+        "parts": record["parts"],
+    }
 
 
 def load_errors(folder: Path) -> ErrorLaw:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from contextlib import closing
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
 from bayesdist.app.artefacts.stars import QUOTED, ErrorLaw
+from bayesdist.app.artefacts.stored_fit import FitArtefacts
 from bayesdist.app.run import Run
 from bayesdist.data import centroid_errors
 from bayesdist.data.matches import Matches
@@ -43,8 +43,8 @@ def fit_campaign(run: Run) -> Run:
         return run.having(**_fitted(run.stars, run.inputs))
 
 
-def _fitted(pairs: Matches, inputs: Inputs) -> dict[str, Any]:
-    """Artefacts of the stage 'fit' by their names."""
+def _fitted(pairs: Matches, inputs: Inputs) -> FitArtefacts:
+    """Artefacts of the stage 'fit'."""
     config = inputs.config
     affine = affine_model_of(config, pairs)
     tables, fit_of_tables = fit_tables(pairs, inputs)

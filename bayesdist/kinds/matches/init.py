@@ -206,17 +206,21 @@ def _of_matches(
 
 
 def _read(
-    matches: str | Path, columns: Mapping[str, str] | None, **options: str
+    matches: str | Path, columns: Mapping[str, str] | None, *, not_finite: str = "refuse"
 ) -> tuple[Matches, str, str, bool]:
     """Matches, the line on their unit, the value of sigma, and whether error columns are read."""
     unit, line = None, ""
     sigma: float | str = "columns"
     while True:
         try:
-            table = load_matches(matches, columns=columns, sigma=sigma, unit=unit, **options)
+            table = load_matches(
+                matches, columns=columns, sigma=sigma, unit=unit, not_finite=not_finite
+            )
         except InputError as error:
             if error.cause == "has no unit" and unit is None:
-                table = load_matches(matches, columns=columns, sigma=1.0, unit="pix", **options)
+                table = load_matches(
+                    matches, columns=columns, sigma=1.0, unit="pix", not_finite=not_finite
+                )
                 unit = _guessed_unit(table, table_layout(matches, columns))
                 line = _GUESSED_UNIT.format(unit=quoted(unit))
             elif error.cause == "holds no errors of the positions" and sigma == "columns":

@@ -6,12 +6,13 @@ import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 from bayesdist.app.artefacts.stars import RunInput
 from bayesdist.app.config import ChipBlock
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data import Matches, input_files, open_matches, read_matches
+from bayesdist.data.reading.options import ReadArguments
 from bayesdist.data.tables.parquet import describe_part
 from bayesdist.errors import InputError
 from bayesdist.kinds.matches.config import Data
@@ -23,7 +24,7 @@ PathLike = str | os.PathLike[str]
 
 
 def load_matches(
-    path: PathLike | Sequence[PathLike], *, format: str = "auto", **options: Any
+    path: PathLike | Sequence[PathLike], *, format: str = "auto", **options: Unpack[ReadArguments]
 ) -> Matches:
     """Read matches of any known format; large Parquet tables stay on disk.
 
@@ -41,15 +42,22 @@ def load_matches(
     return read_matches(path, format=format, **options)
 
 
-def reading_options(data: Data, chips: Sequence[ChipBlock]) -> dict[str, Any]:
+def reading_options(data: Data, chips: Sequence[ChipBlock]) -> ReadArguments:
     """Options of `load_matches` from a section [data]; tables may refer to chips by name."""
-    names = (
-        *("format", "columns", "unit", "sigma", "pixel_origin", "tangent_point"),
-        *("epoch", "catalogue_epoch", "not_finite", "same_position", "plate_scale"),
-        "motion_prior",
-    )
-    numbers = {chip.name: chip.number for chip in chips}
-    return {name: getattr(data, name) for name in names} | {"chips": numbers or None}
+    return {
+        "columns": data.columns,
+        "unit": data.unit,
+        "sigma": data.sigma,
+        "pixel_origin": data.pixel_origin,
+        "tangent_point": data.tangent_point,
+        "epoch": data.epoch,
+        "catalogue_epoch": data.catalogue_epoch,
+        "chips": {chip.name: chip.number for chip in chips} or None,
+        "not_finite": data.not_finite,
+        "same_position": data.same_position,
+        "plate_scale": data.plate_scale,
+        "motion_prior": data.motion_prior,
+    }
 
 
 def is_large(path: PathLike | Sequence[PathLike]) -> bool:
@@ -104,7 +112,7 @@ def read_configured(
     source = source_of(data.format)
     if source is not None and size is not None:
         return source.read(path, data, size)
-    return load_matches(path, **reading_options(data, chips))
+    return load_matches(path, format=data.format, **reading_options(data, chips))
 
 
 def mission_template(matches: str | Path) -> Template | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 from bayesdist.app.artefacts.stars import (
     QUOTED,
@@ -17,6 +17,7 @@ from bayesdist.app.artefacts.stars import (
 )
 from bayesdist.app.artefacts.stored_fit import (
     FIT,
+    FitArtefacts,
     converged_posterior,
     hierarchy_of,
     read_stored_fit,
@@ -118,11 +119,8 @@ def _fitted(
     model: DistortionModel,
     config: MatchesConfig,
     earlier: CalibrationPrior | None,
-) -> dict[str, Any]:
-    """Fit with errors by magnitude, or with the quoted errors adjusted to the residuals.
-
-    The result has the artefacts of the stage 'fit' by their names.
-    """
+) -> FitArtefacts:
+    """Fit with errors by magnitude, or with the quoted errors adjusted to the residuals."""
     stars, reader = run.stars, run.reader
     priors = priors_of(model, config)
     rejection = Rejection(config.fit.clip_chi2, config.fit.clip_abs, config.fit.radial_weight)

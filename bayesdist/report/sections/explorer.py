@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from typing import TypedDict
 
 import matplotlib
 import numpy as np
@@ -25,12 +26,115 @@ MOST_POINTS = 65  # along the longer side of a map; a pointer cannot resolve mor
 _COLORS = 12
 
 
+Numbers = list[float | None]  # None (null in JSON) for missing numbers
+
+
+class ChipEntry(TypedDict):
+    """A chip and its place in the drawing of the detector."""
+
+    number: int
+    name: str
+    size: list[float]
+    place: list[float]
+
+
+class PageData(TypedDict):
+    """Units, colours and chips of the page."""
+
+    unit: str
+    scale_mas: float | None
+    ladders: dict[str, Sequence[object]]
+    colors: list[str]
+    chips: list[ChipEntry]
+
+
+class RowEntry(TypedDict):
+    """A row of the budget."""
+
+    name: str
+    kind: str
+    source: str
+
+
+class LocalEntry(RowEntry):
+    """A local error: sigma on the grid, by chip and axis."""
+
+    sigma: dict[str, list[Numbers]]
+
+
+class GivenEntry(RowEntry):
+    """An error that is the same everywhere, by axis."""
+
+    sigma: list[float]
+
+
+class ProductEntry(RowEntry):
+    """Displacements on the grid, by span, chip, node and axis."""
+
+    spans: list[dict[str, list[list[Numbers]]]]
+
+
+class CentroidEntry(RowEntry):
+    """Knots of the interpolation in magnitude: logarithms of the errors, and their slopes."""
+
+    mag: list[float]
+    log: list[Numbers]
+    slope: list[Numbers]
+
+
+class SpanEntry(TypedDict):
+    """Second moments of the errors between two epochs, by chip, part, node and axis."""
+
+    nodes: list[float]
+    moments: dict[str, dict[str, list[list[Numbers]]]]
+
+
+class BudgetData(PageData):
+    """Error budget as a function of position, epoch and magnitude."""
+
+    terms: list[tuple[int, int]]  # powers of x and y
+    grid: list[int]
+    epoch: float | None
+    years: list[float] | None
+    parts: list[RowEntry]
+    joint: str
+    spans: list[SpanEntry]
+    local: list[LocalEntry]
+    given: list[GivenEntry]
+    centroid: CentroidEntry | None
+    products: list[ProductEntry]
+    cycle: list[str]
+
+
+class MapEntry(TypedDict):
+    """Values of a map row by row; the shape has the number of columns first."""
+
+    shape: list[int]
+    values: Numbers
+
+
+class LayerEntry(TypedDict):
+    """Maps of one quantity, by chip."""
+
+    name: str
+    unit: str
+    digits: int
+    maps: list[MapEntry]
+
+
+class MapData(PageData):
+    """Maps that are read with a pointer."""
+
+    layers: list[LayerEntry]
+
+
 @REPORT.data(needs=("evaluation.surface",))
-def budget_data(run: ReportedRun) -> dict[str, Any]:
+def budget_data(run: ReportedRun) -> BudgetData:
     """Error budget as a function of position, epoch and magnitude."""
     s = needed(run.evaluation.surface)
     nodes = s.spans[0].nodes
-    return _common(run) | {
+    return {
+        **_common(run),
         "terms": list(s.model.basis(s.model.chips[0].number).terms),
         "grid": list(s.grid),
         "epoch": s.epoch,
@@ -48,8 +152,8 @@ def budget_data(run: ReportedRun) -> dict[str, Any]:
             for span in s.spans
         ],
         "local": [
-            _row(t.row)
-            | {
+            {
+                **_row(t.row),
                 "sigma": {
                     str(chip): [_short(v[0, :, axis], MAP_DIGITS) for axis in (0, 1)]
                     for chip, v in t.values[0].items()
@@ -57,7 +161,7 @@ def budget_data(run: ReportedRun) -> dict[str, Any]:
             }
             for t in s.local
         ],
-        "given": [_row(row) | {"sigma": sigma.tolist()} for row, sigma in s.constant],
+        "given": [{**_row(row), "sigma": sigma.tolist()} for row, sigma in s.constant],
         "centroid": _centroid(s),
         "products": [_product(term) for term in s.products],
         "cycle": list(CYCLE),
@@ -65,7 +169,7 @@ def budget_data(run: ReportedRun) -> dict[str, Any]:
 
 
 @REPORT.data()
-def map_data(run: ReportedRun) -> dict[str, Any]:
+def map_data(run: ReportedRun) -> MapData:
     """Maps of the uncertainty per axis and the pixel area, read with a pointer."""
     layers = []
     for maps in zip(*shown_maps(run), strict=True):
@@ -74,10 +178,10 @@ def map_data(run: ReportedRun) -> dict[str, Any]:
     layers.append(
         _layer("Pixel area, relative", "", [area.area for area in run.evaluation.areas], digits=7)
     )
-    return _common(run) | {"layers": layers}
+    return {**_common(run), "layers": layers}
 
 
-def _common(run: ReportedRun) -> dict[str, Any]:
+def _common(run: ReportedRun) -> PageData:
     colors = matplotlib.colormaps[SEQUENTIAL](np.linspace(0.0, 1.0, _COLORS))
     return {
         "unit": run.model.unit,
@@ -96,7 +200,7 @@ def _common(run: ReportedRun) -> dict[str, Any]:
     }
 
 
-def _layer(name: str, unit: str, maps: list[Float], digits: int = MAP_DIGITS) -> dict[str, Any]:
+def _layer(name: str, unit: str, maps: list[Float], digits: int = MAP_DIGITS) -> LayerEntry:
     thin = [m[:: _step(m.shape[0]), :: _step(m.shape[1])] for m in maps]
     return {
         "name": name,
@@ -112,7 +216,7 @@ def _step(n: int) -> int:
     return steps[0] if steps else 1
 
 
-def _triangles(moments: Float) -> list[list[list[float | None]]]:
+def _triangles(moments: Float) -> list[list[Numbers]]:
     """Upper triangles row by row, by node and axis; symmetric elements are added."""
     K = moments.shape[-1]
     i, j = np.triu_indices(K)
@@ -121,34 +225,32 @@ def _triangles(moments: Float) -> list[list[list[float | None]]]:
     return [[_short(v, digits) for v in node] for node in values]
 
 
-def _row(row: Row) -> dict[str, Any]:
+def _row(row: Row) -> RowEntry:
     return {"name": row.name, "kind": row.kind, "source": row.source}
 
 
-def _product(term: GridRow) -> dict[str, Any]:
+def _product(term: GridRow) -> ProductEntry:
     """Displacements on the grid, by span, chip, node and axis."""
-    spans = [
+    spans: list[dict[str, list[list[Numbers]]]] = [
         {
             str(chip): [[_short(node[:, axis], MOMENT_DIGITS) for axis in (0, 1)] for node in nodes]
             for chip, nodes in shifts.items()
         }
         for shifts in term.values
     ]
-    return _row(term.row) | {"spans": spans}
+    return {**_row(term.row), "spans": spans}
 
 
-def _short(values: Float, digits: int) -> list[float | None]:
+def _short(values: Float, digits: int) -> Numbers:
     """Numbers rounded to `digits` digits; None (null in JSON) for missing numbers."""
     return [float(f"{v:.{digits - 1}e}") if np.isfinite(v) else None for v in np.ravel(values)]
 
 
-def _centroid(s: BudgetSurface) -> dict[str, Any] | None:
+def _centroid(s: BudgetSurface) -> CentroidEntry | None:
     """Knots of the interpolation: logarithms of the errors, and their slopes."""
     errors = s.centroid
     if errors is None:
         return None
-    out: dict[str, Any] = {"name": CENTROID, "kind": "random", "source": MEASURED}
-    out["mag"] = [float(m) for m in errors.mag]
     logs = [np.log(sigma) for sigma in (errors.sigma_u, errors.sigma_v)]
     slopes = [
         PchipInterpolator(errors.mag, log).derivative()(errors.mag)
@@ -156,6 +258,11 @@ def _centroid(s: BudgetSurface) -> dict[str, Any] | None:
         else np.zeros(1)
         for log in logs
     ]
-    out["log"] = [_short(log, MOMENT_DIGITS) for log in logs]
-    out["slope"] = [_short(slope, MOMENT_DIGITS) for slope in slopes]
-    return out
+    return {
+        "name": CENTROID,
+        "kind": "random",
+        "source": MEASURED,
+        "mag": [float(m) for m in errors.mag],
+        "log": [_short(log, MOMENT_DIGITS) for log in logs],
+        "slope": [_short(slope, MOMENT_DIGITS) for slope in slopes],
+    }
