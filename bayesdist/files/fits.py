@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import logging
 import re
 import warnings
 
@@ -11,6 +12,8 @@ from astropy.io import fits
 
 from bayesdist.errors import FormatError
 from bayesdist.files.budget import Budget
+
+log = logging.getLogger("bayesdist")
 
 FITS_START = b"SIMPLE  ="
 HDU_STARTS = (FITS_START, b"XTENSION=")
@@ -89,6 +92,26 @@ def refuse_rest(raw: bytes, end: int, budget: Budget) -> None:
             "damaged or missing",
             where=budget.where,
             do="fetch or write it again",
+        )
+
+
+def warn_of_missing_extensions(header: fits.Header, n: int, where: str) -> None:
+    """Log a warning if a FITS file has fewer extensions than its primary header states.
+
+    A file that was cut exactly between two HDUs is valid. `header` is that of the primary HDU, with
+    the number of extensions in NEXTEND as in files of the HST; `n` extensions follow.
+    """
+    try:
+        stated = header.get("NEXTEND", 0)
+    except (ValueError, fits.VerifyError):
+        return  # the card has no value
+    if isinstance(stated, int) and stated > n:
+        log.warning(
+            "%s: its primary header states %d extensions (NEXTEND), and the file has %d: the "
+            "others are missing, or the file is truncated",
+            where,
+            stated,
+            n,
         )
 
 

@@ -35,6 +35,7 @@ from bayesdist.files.fits import (
     ldac_image_header,
     open_fits,
     refuse_long_arrays,
+    warn_of_missing_extensions,
 )
 from bayesdist.files.parquet import parquet_table
 from bayesdist.files.regular import head_of
@@ -195,6 +196,7 @@ def _says_number(cell: str) -> bool:
 def _read_fits(path: Path, limits: Limits) -> Table:
     raw, budget = read_unpacked(path, limits)
     with open_fits(raw, budget) as hdus:
+        warn_of_missing_extensions(hdus[0].header, len(hdus) - 1, str(path))
         tables = [
             hdu
             for hdu in hdus

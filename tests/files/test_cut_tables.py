@@ -10,6 +10,7 @@ from astropy.table import Table
 
 from bayesdist.errors import FormatError
 from bayesdist.files.tables import read_table
+from bayesdist.products.common.content import read_content
 from bayesdist.products.registry import open_document
 
 KINDS = {
@@ -126,3 +127,24 @@ def test_a_fits_file_that_does_not_end_with_its_last_hdu(tmp_path):
     for more in (bytes(2880), b" " * 240, bytes(512), b"\n", b"\0\r\n"):
         path.write_bytes(raw + more)
         assert len(read_table(path)) == 2
+
+
+@pytest.mark.parametrize(
+    ("stated", "says"),
+    [(2, True), (1, False), (0, False), ("'two'", False), ("1 2 3", False), (None, False)],
+)
+def test_a_fits_file_that_was_cut_between_two_hdus(tmp_path, caplog, stated, says):
+    """HST states the number of extensions in the primary header."""
+    path = tmp_path / "stars.fits"
+    Table({"x": [1.0, 2.0]}).write(path)
+    raw = path.read_bytes()
+    if stated is not None:
+        card = f"NEXTEND = {stated}".ljust(80).encode()
+        end = raw.index(b"END" + 77 * b" ")
+        raw = raw[:end] + card + raw[end : end + 80] + raw[end + 160 :]
+    path.write_bytes(raw)
+    for read in (read_table, read_content):
+        caplog.clear()
+        read(path)
+        warned = [r for r in caplog.records if "states 2 extensions (NEXTEND)" in r.message]
+        assert len(warned) == says

@@ -40,6 +40,7 @@ from bayesdist.files.fits import (
     refuse_long_arrays,
     refuse_many_rows,
     refuse_rest,
+    warn_of_missing_extensions,
 )
 from bayesdist.files.unpacked import read_unpacked
 from bayesdist.products.common.cards import card_images, header_of
@@ -248,6 +249,10 @@ def read_content(path: str | os.PathLike[str]) -> Content:
     """
     raw, budget = read_unpacked(path)
     content = Content(str(path), raw, Path(path), budget.size)
+    with readable(content.name):
+        hdus = content.tables
+    if hdus:
+        warn_of_missing_extensions(hdus[0].header, len(hdus) - 1, content.name)
     if content.is_fits and LDAC_IMAGE.encode() in raw:
         headers = _headers_of_images(content)
         return replace(content, raw=headers) if headers else content
