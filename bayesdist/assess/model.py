@@ -262,7 +262,14 @@ def diagnosed_error_model(
     measured: list[ErrorTerm] = []
     correlated = diagnostics.correlated
     if correlated is not None and correlated.structure:
-        measured.append(StructureErrors(correlated, frames, structure_left))
+        ambiguous = (
+            diagnostics.shows_structure
+            and not any(isinstance(term, CatalogueSystematics) for term in terms)
+            # exposures that point elsewhere move structure of the catalogue over the detector
+            and posterior.model.frames == "none"
+            and not aligned
+        )
+        measured.append(StructureErrors(correlated, frames, structure_left, ambiguous=ambiguous))
     if correlated is not None and correlated.linear is not None:
         measured.append(Deviations(correlated, single, frames))
     if correlated is not None and correlated.fields is not None:

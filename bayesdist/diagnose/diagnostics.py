@@ -171,6 +171,12 @@ class Diagnostics:
         return worst_misfit(self.misfits)
 
     @property
+    def shows_structure(self) -> bool:
+        """True if the residuals significantly contain structure that the model does not have."""
+        tests = any(test.significant and test.held_by == "structure" for test in self.score_tests)
+        return tests or any(misfit.significant for misfit in self.misfits)
+
+    @property
     def shown(self) -> tuple[BinnedSums, ...]:
         """Sums of residuals for maps of their means, one per chip."""
         return tuple(self.sums.binned[c, bins[SHOWN]] for c, bins in self.partitions.items())

@@ -1,5 +1,5 @@
 import tracemalloc
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -396,6 +396,36 @@ def test_a_catalogue_that_varies_is_judged_by_its_worst_form(exact):
     doubt = Check("Fit", "Residuals", sentence="the residuals go with magnitude", doubt=LARGER)
     (doubted,) = margins_of(exact, limit, terms=[catalogue("a", 0.01)], checks=[doubt])
     assert doubt.sentence in doubted.reason and "varies over the field" in doubted.reason
+
+
+@dataclass(frozen=True)
+class OfTwoCauses(UserTerm):
+    """An offset that is as large as another one if it has its other cause."""
+
+    other: UserTerm | None = None
+
+    @property
+    def alternative(self) -> UserTerm | None:
+        return self.other
+
+
+@pytest.mark.parametrize(("of_detector", "of_catalogue"), [(0.005, 0.02), (0.02, 0.005)])
+def test_an_error_of_unknown_cause_is_judged_by_both(exact, of_detector, of_catalogue):
+    """A limit between the two is neither met nor missed; any other one is as with one cause."""
+    limits = [Requirement(f"{limit}", "max", limit) for limit in (1e-4, 0.015, 0.1)]
+    other = UserTerm("structure", "systematic", of_catalogue, of_catalogue)
+    term = OfTwoCauses("structure", "systematic", of_detector, of_detector, other=other)
+    smaller = UserTerm("structure", "systematic", 0.005, 0.005)
+    verdicts = [m.verdict for m in margins_of(exact, limits, terms=[term])]
+    assert verdicts == ["missed", "not shown", "met"]
+    (alone,) = margins_of(exact, limits[1:2], terms=[smaller])
+    assert alone.verdict == "met"
+    between = margins_of(exact, limits[1:2], terms=[term])[0]
+    assert "detector's or the catalogue's" in between.reason
+    assert between.probability_met < alone.probability_met
+    doubt = Check("Fit", "Residuals", sentence="the residuals go with magnitude", doubt=LARGER)
+    (doubted,) = margins_of(exact, limits[1:2], terms=[term], checks=[doubt])
+    assert doubted.verdict == "undecided" and doubt.sentence in doubted.reason
 
 
 @pytest.mark.parametrize(("stars", "small"), [(1500, True), (20, False)])

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from bayesdist.assess.domain import EvaluationDomain, WorstPosition
-from bayesdist.assess.drawn import DrawnErrors
+from bayesdist.assess.drawn import DrawnErrors, generators
 from bayesdist.assess.requirements.requirement import Requirement
 from bayesdist.assess.requirements.verdict import (
     MISSED_BELOW,
@@ -29,7 +29,7 @@ from bayesdist.assess.requirements.verdict import (
     verdict_of,
 )
 from bayesdist.assess.solution import place_of
-from bayesdist.assess.terms.forms import VaryingTerm
+from bayesdist.assess.terms.forms import AmbiguousTerm, VaryingTerm
 from bayesdist.assess.units import convert
 from bayesdist.diagnose.statistics import clopper_pearson
 from bayesdist.errors import InputError
@@ -208,7 +208,8 @@ def judge(
     doubts = doubts_of(checks)
     tallies = _tallied(errors, requirements, cases, factors, grid, doubts, adaptive=adaptive)
     varying = [t.rows[0].name for t in errors.terms if isinstance(t, VaryingTerm) and t.varies]
-    ways, margins = (errors, *errors.treatments(grid)), []
+    ways, margins = _ways(errors, grid), []
+    ambiguous = any(term.alternative for term in errors.terms if isinstance(term, AmbiguousTerm))
     for r, case, factor, (by_epoch, by_way) in zip(
         requirements, cases, factors, tallies, strict=True
     ):
@@ -217,13 +218,32 @@ def judge(
             for k, way in enumerate(ways)
         ]
         worse = min(range(len(ways)), key=lambda k: extremes[k].probability_met)
-        margin = _of_extremes(extremes, extremes[worse], varying, doubts)
+        margin = _of_extremes(extremes, extremes[worse], varying, doubts, ambiguous=ambiguous)
         if extremes[worse].verdict in ("missed", "not shown") and not doubts:
             worst_epoch = next(domain for domain in case if domain.epoch == margin.epoch)
             remedy = required_reduction(ways[worse], r, worst_epoch, factor)
             margin = replace(margin, remedy=remedy)
         margins.append(margin)
     return tuple(margins)
+
+
+def _ways(errors: DrawnErrors, grid: tuple[int, int]) -> tuple[DrawnErrors, ...]:
+    """Draws in which errors of unknown extent or cause have each of the possible ones.
+
+    If any term has an alternative cause, it has that in the last ones.
+    """
+    ways = (errors, *errors.treatments(grid))
+    terms = tuple(
+        (isinstance(term, AmbiguousTerm) and term.alternative) or term for term in errors.terms
+    )
+    if terms == errors.terms:
+        return ways
+    random = generators(terms, errors.seed)
+    draws = tuple(
+        old if new is term else new.draw(errors.n_draws, rng)
+        for old, term, new, rng in zip(errors.draws, errors.terms, terms, random, strict=True)
+    )
+    return (*ways, replace(errors, terms=terms, draws=draws, further=None, _cache={}))
 
 
 def _tallied(
@@ -244,7 +264,7 @@ def _tallied(
     batch, total, out = errors, 0, list[tuple[list[list[Float]], list[Tally]]]()
     undecided = list(range(len(requirements)))
     for number in count(1):
-        ways = (batch, *batch.treatments(grid))
+        ways = _ways(batch, grid)
         wanted: dict[EvaluationDomain, set[str]] = {}
         for i in undecided:
             for domain in cases[i]:
@@ -386,17 +406,35 @@ def _chips_of(
 
 
 def _of_extremes(
-    margins: Sequence[Margin], worse: Margin, names: Sequence[str], doubts: Sequence[Check]
+    margins: Sequence[Margin],
+    worse: Margin,
+    names: Sequence[str],
+    doubts: Sequence[Check],
+    *,
+    ambiguous: bool,
 ) -> Margin:
-    """The least favourable margin, `worse`, with a verdict that is valid for all margins."""
+    """The least favourable margin, `worse`, with a verdict that is valid for all margins.
+
+    `names` are those of errors that may vary over the field.  If `ambiguous`, the last margin is
+    that with structure of the catalogue.
+    """
     better = max(margins, key=lambda m: m.probability_met)
     if all(m.verdict == worse.verdict for m in margins) or worse.verdict == "undecided":
         return worse
-    vary = "varies" if len(names) == 1 else "vary"
-    reason = (
-        f"it depends on how {' and '.join(names)} {vary} over the field: as one offset, a smooth "
-        f"field, or independent errors, P(met) is {_fraction(worse)} to {_fraction(better)}"
-    )
+    of_one_cause = margins[:-1] if ambiguous else margins
+    if ambiguous and len({m.verdict for m in of_one_cause}) == 1:
+        reason = (
+            "it depends on whether the unmodelled structure is the detector's or the catalogue's, "
+            "which the residuals do not tell (state the catalogue's errors by [catalogue], or add "
+            "exposures that point elsewhere): "
+        )
+    else:
+        vary = "varies" if len(names) == 1 else "vary"
+        reason = (
+            f"it depends on how {' and '.join(names)} {vary} over the field: as one offset, a "
+            "smooth field, or independent errors, "
+        )
+    reason += f"P(met) is {_fraction(worse)} to {_fraction(better)}"
     if doubts:
         texts = [*(check.sentence for check in doubts), reason]
         return replace(worse, verdict="undecided", reason="; ".join(texts))

@@ -6,7 +6,7 @@ Errors that are shared by all stars near a position and vary over the detector.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -58,6 +58,9 @@ class StructureErrors:
     frames: bool = False  # True to include errors of the exposure frames
     # True to include structure omitted at a position; False if look-up table errors represent it
     left: bool = True
+    # True if the residuals do not tell whether structure is the detector's or the catalogue's
+    ambiguous: bool = False
+    of_catalogue: bool = False  # True for a structure of the catalogue, which the parameters follow
 
     @property
     def rows(self) -> tuple[Row, ...]:
@@ -65,9 +68,18 @@ class StructureErrors:
         in_fit = Row(STRUCTURE_IN_FIT, source=SOURCE)
         return (in_fit, Row(STRUCTURE, LOCAL, SOURCE)) if self.left else (in_fit,)
 
+    @property
+    def alternative(self) -> StructureErrors | None:
+        """The same structure as an error of the catalogue; None unless its origin is ambiguous."""
+        if not self.ambiguous:
+            return None
+        return replace(self, left=False, ambiguous=False, of_catalogue=True)
+
     def draw(self, n: int, rng: np.random.Generator) -> ErrorDraws:
         """First n draws of the posterior, repeated if n is larger."""
         discrepancy, shift = self.discrepancy, self.discrepancy.structure_theta
+        if self.of_catalogue:
+            shift = discrepancy.structure_of_catalogue()
         rows = np.arange(n) % len(shift)
         theta, pool = _moved(discrepancy, shift[rows], self.frames), Pool(rows, len(shift))
         fit = Polynomials(

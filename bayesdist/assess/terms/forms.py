@@ -127,6 +127,16 @@ class VaryingTerm(ErrorTerm, Protocol):
 
 
 @runtime_checkable
+class AmbiguousTerm(ErrorTerm, Protocol):
+    """A term whose cause is unknown if the data fit two causes."""
+
+    @property
+    def alternative(self) -> ErrorTerm | None:
+        """The error if it has the other cause; None if the cause is known."""
+        ...
+
+
+@runtime_checkable
 class SizedTerm(ErrorTerm, Protocol):
     """A term whose size the user states as one number."""
 

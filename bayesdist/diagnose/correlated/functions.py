@@ -140,6 +140,16 @@ class StructureFunctions:
         i, j = self._waves.T - 1
         return np.stack([by_axis[0][i, a] * by_axis[1][j, b] for a, b in low])
 
+    def low_orders(self, sines: Float) -> Float:
+        """Coefficients (..., K) of the model's Legendre products in a field of the raw sines.
+
+        `sines` (..., n_sines) are the coefficients of the sines.  `evaluate` subtracts these
+        polynomials.
+        """
+        i, j = np.array(polynomial_terms(self.order)).T
+        orthonormal = sines @ self._in_polynomials.T
+        return np.asarray(orthonormal * np.sqrt((2 * i + 1) * (2 * j + 1)))
+
     def finer_waves(self, rng: np.random.Generator) -> Float:
         """Wave vectors (FINE, 2) of structure finer than the sines, in inverse half sides.
 

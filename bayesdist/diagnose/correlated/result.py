@@ -181,6 +181,22 @@ class Discrepancy:
         """Number of draws."""
         return len(self.structure_theta)
 
+    def structure_of_catalogue(self) -> Float:
+        """Error (n, D) of the parameters in each draw if the structure is the catalogue's.
+
+        A structure of the detector is an error where the model lacks it, and low orders of it are
+        part of the polynomials.  A structure of the catalogue is an error where the fit follows it,
+        low orders above all; what the model lacks then is no error of the calibration.
+        """
+        out = self.structure_theta.copy()
+        for number, chip in self.structure.items():
+            first = chip.functions.n_terms
+            sines = chip.coefficients[:, :, first : first + chip.functions.n_sines]
+            low = chip.functions.low_orders(sines)
+            for a in (0, 1):
+                out[:, self.model.coefficient_slice(number, a)] -= low[:, a]
+        return out
+
     @property
     def stored(self) -> Discrepancy:
         """Discrepancy with the precision of files: structure coefficients in single precision."""

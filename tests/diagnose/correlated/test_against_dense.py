@@ -7,6 +7,7 @@ import pytest
 
 from bayesdist.diagnose.correlated.functions import StructureFunctions
 from bayesdist.diagnose.correlated.information import Information, cell_sums
+from bayesdist.diagnose.correlated.result import ChipStructure, Discrepancy
 from bayesdist.diagnose.correlated.structure import structure_posterior
 from bayesdist.infer import GaussianPriors
 from bayesdist.infer.solution.solution import likelihood_of
@@ -85,6 +86,39 @@ def test_sines_are_orthogonal_to_the_polynomials_over_the_chip():
             p = np.polynomial.legendre.Legendre.basis(i)(X)
             p = p * np.polynomial.legendre.Legendre.basis(j)(Y)
             assert np.abs(B.T @ (w * p)).max() < 1e-12
+
+
+def test_a_fit_follows_structure_of_the_catalogue():
+    """Least squares of the field itself, low orders included, which the functions leave out."""
+    rng = np.random.default_rng(6)
+    fit, table, _ = matched(800, rng)
+    model, n = fit.model, 5
+    chip = model.chips[0]
+    functions = StructureFunctions(model.order, chip.size, 8)
+    waves = functions.finer_waves(rng)
+    z = rng.standard_normal((n, 2, functions.n_known + 2 * len(waves)))
+    structure = ChipStructure(functions, waves, z)
+    X, Y = model.basis().scaled(table.x, table.y)
+    phi, values = model.basis().evaluate_scaled(X, Y), structure.evaluate(X, Y)
+
+    def fitted(field):
+        """Parameters (n, D) of least squares of fields (n, 2, N)."""
+        out = np.zeros((n, model.n_params))
+        for a in (0, 1):
+            columns = model.coefficient_slice(chip.number, a)
+            out[:, columns] = np.linalg.lstsq(phi, field[:, a].T)[0].T
+        return out
+
+    T, S = functions.n_terms, functions.n_sines
+    i, j = functions._waves.T - 1
+    raw = values.copy()
+    raw[:, T : T + S] = functions._along(0, X)[:, i] * functions._along(1, Y)[:, j]
+    zero = np.zeros((model.n_params, model.n_params))
+    followed = -fitted(z @ values.T)
+    found = Discrepancy(
+        model, fit.mean, zero, zero, {chip.number: structure}, followed, linear=None
+    )
+    np.testing.assert_allclose(found.structure_of_catalogue(), -fitted(z @ raw.T), atol=1e-9)
 
 
 def test_the_sines_have_the_covariance_of_a_matern_field():
