@@ -43,6 +43,25 @@ def test_the_first_cause_leads():
     assert remedies((BY_POSITION, 100, 12)) == {BY_POSITION.name: BY_POSITION.remedy}
 
 
+@pytest.mark.parametrize(
+    ("p_skewness", "noisy", "displaced"),
+    [(1e-3, True, True), (0.05, True, False), (1e-3, False, False)],
+)
+def test_structure_that_widens_the_residuals_is_of_displaced_stars(p_skewness, noisy, displaced):
+    """A hint of skewness suffices if noise and structure are found together, and only then."""
+    order = order_family(4, 3)
+    p_values = {order: 1e-12, SKEWNESS: p_skewness, BY_POSITION: 1e-12 if noisy else 0.5}
+    outcomes = [
+        Outcome(family, 100, 12, None, p, 0.01, lambda level: 0.01, "pix")
+        for family, p in (p_values | {RADIUS_OF_MATCH: 0.5}).items()
+    ]
+    # with as many tests the skewness alone is not significant
+    tests = {test.name: test for test in corrected([*outcomes, *[outcomes[-1]] * 20])}
+    assert tests[order.name].significant and not tests[SKEWNESS.name].significant
+    assert tests[order.name].remedy == (SKEWNESS if displaced else order).remedy
+    assert ("the shape of the residuals" in tests[order.name].finding) == displaced
+
+
 def test_no_finding_is_its_own_cause():
     names = list(CAUSES)
     for name, cause in CAUSES.items():
