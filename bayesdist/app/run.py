@@ -79,7 +79,7 @@ STAGES: Mapping[str, tuple[str, ...]] = {
 PROVENANCE = ("command", "created", "seed", "inputs", "versions")  # facts of run.json
 # artefacts, and what was derived from them, that pickled runs keep if they have been used
 RESULTS = ("posterior", "diagnostics", "evaluation")
-DERIVED = ("solution", "previous", "report_data")
+DERIVED = ("config", "solution", "previous", "report_data")
 ORDER = {name: place for place, names in enumerate(STAGES.values()) for name in names}
 
 
