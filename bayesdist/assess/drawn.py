@@ -226,10 +226,14 @@ class DrawnErrors:
         return WorstPosition(*at, float(np.sqrt(total[k])))
 
     def sizes(self, domain: EvaluationDomain) -> dict[str, float]:
-        """Radial rms of each row over the positions, in the unit of the errors."""
+        """Radial rms of each row over the positions, in the unit of the errors.
+
+        Rows that are the same everywhere are left out if the domain is one of differences.
+        """
         squares: dict[str, Float] = {}
         for errors in self.at(domain.positions):
-            if not any(row.kind == PRODUCT for row in errors.rows):
+            cancels = errors.uniform and domain.relative
+            if not cancels and not any(row.kind == PRODUCT for row in errors.rows):
                 squares |= errors.squares()
         return {name: float(np.sqrt(np.mean(s.sum(axis=1)))) for name, s in squares.items()}
 

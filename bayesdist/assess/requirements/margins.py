@@ -44,6 +44,7 @@ MOST_DRAWS = 512_000  # 99.9 % of verdicts are right 0.001 from the required pro
 DRAWS_AT_ONCE = 32_000  # number of draws added at a time, to limit memory
 DRAWS = 1000  # number of draws, sufficient for a factor accurate to one or two percent
 STEPS = 9  # number of bisections of the interval that contains the factor
+CANDIDATES = 12  # number of terms, the largest, of which a reduction is tried
 BAND = 0.95  # level of the interval of a probability
 
 
@@ -514,7 +515,8 @@ def required_reduction(
 ) -> RequiredReduction | None:
     """Find the term that needs the smallest reduction for a requirement to be met.
 
-    Each term in turn is multiplied by a number between 0 and 1, with the same draws throughout.
+    Each of the largest terms in turn is multiplied by a number between 0 and 1, with the same draws
+    throughout.
 
     `domain`: positions at the worst epoch. `factor`: size of the solution's unit in the unit of the
     requirement. Returns None if the requirement is met with the draws used here.
@@ -531,11 +533,12 @@ def required_reduction(
     if met("", 1.0):  # met with these draws, so that no reduction can be stated
         return None
     sizes = {name: factor * size for name, size in errors.sizes(domain).items()}
-    largest = max(sizes, key=lambda name: sizes[name])
+    candidates = sorted(sizes, key=lambda name: -sizes[name])[:CANDIDATES]
+    largest = candidates[0]
     best, best_factor = "", 0.0
-    for name, size in sizes.items():
+    for name in candidates:
         # terms that need a larger reduction than the best one so far are skipped
-        if size > 0 and met(name, best_factor):
+        if sizes[name] > 0 and met(name, best_factor):
             low, high = 0.0, 1.0
             for _ in range(STEPS):
                 middle = (low + high) / 2
