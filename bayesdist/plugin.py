@@ -100,6 +100,11 @@ def plugins() -> dict[str, Plugin]:
     return loaded
 
 
+def packages() -> frozenset[str]:
+    """Names of the top-level packages that define plugins."""
+    return frozenset(entry.module.partition(".")[0] for entry in _entries())
+
+
 def missions() -> dict[str, Mission]:
     """Missions of all plugins, by name."""
     return {

@@ -7,7 +7,7 @@ the other arrays by name. Values are restored exactly, to the last bit.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import fields, is_dataclass
 from importlib import import_module
 from pathlib import Path
@@ -23,7 +23,7 @@ from bayesdist.files.hdf5 import read_arrays, write_arrays
 T = TypeVar("T")
 
 TREE = "tree"
-PACKAGE = "bayesdist."  # only classes of this package are created from files
+PACKAGE = "bayesdist"
 
 
 def write_record(path: Path, record: Any, fingerprint: str = "") -> None:
@@ -31,16 +31,24 @@ def write_record(path: Path, record: Any, fingerprint: str = "") -> None:
     write_arrays(path, fingerprint, record_to_arrays(record))
 
 
-def read_record(path: Path, kind: type[T], what: str, *, do: str, fingerprint: str = "") -> T:
+def read_record(
+    path: Path,
+    kind: type[T],
+    what: str,
+    *,
+    do: str,
+    fingerprint: str = "",
+    packages: Collection[str] = (),
+) -> T:
     """Read the record of a file.
 
     `kind`: class of the record. `what`: the record in words, with its article, for error messages.
-    `do`: advice on how to make the file again. Raises InputError if the file has another
-    fingerprint, FormatError if it contains no such record.
+    `do`: advice on how to make the file again. `packages`: see `record_from_arrays`. Raises
+    InputError if the file has another fingerprint, FormatError if it contains no such record.
     """
     arrays = read_arrays(path, fingerprint, what, do=do)
     with restoring(path, what, do=do):
-        record: T = record_from_arrays(arrays, kind)
+        record: T = record_from_arrays(arrays, kind, packages)
         return record
 
 
@@ -73,14 +81,17 @@ def record_to_arrays(record: Any) -> dict[str, NDArray[Any]]:
     return {TREE: np.frombuffer(tree.encode(), np.uint8), **writer.arrays}
 
 
-def record_from_arrays(arrays: Mapping[str, NDArray[Any]], kind: type = object) -> Any:
+def record_from_arrays(
+    arrays: Mapping[str, NDArray[Any]], kind: type = object, packages: Collection[str] = ()
+) -> Any:
     """Restore a record from the arrays of `record_to_arrays`.
 
-    `kind`: class of the record. Raises TypeError, KeyError or AttributeError if the arrays do not
-    contain such a record.
+    `kind`: class of the record. `packages`: names of the packages whose classes the record may
+    contain, in addition to those of bayesdist. Raises TypeError, KeyError or AttributeError if the
+    arrays do not contain such a record.
     """
     tree = json_of(np.asarray(arrays[TREE], np.uint8).tobytes().decode(), "record")
-    record = _Reader(arrays).of(tree)
+    record = _Reader(arrays, {PACKAGE, *packages}).of(tree)
     if not isinstance(record, kind):
         raise TypeError(f"holds a {type(record).__name__}, and no {kind.__name__}")
     return record
@@ -148,8 +159,8 @@ class _Writer:
 class _Reader:
     """Restores a record from its tree; equal trees of one class give the same object."""
 
-    def __init__(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        self._arrays = arrays
+    def __init__(self, arrays: Mapping[str, NDArray[Any]], packages: Collection[str]) -> None:
+        self._arrays, self._packages = arrays, packages
         self._made: dict[str, Any] = {}
 
     def of(self, tree: Any) -> Any:
@@ -168,20 +179,23 @@ class _Reader:
         if "dict" in tree:
             key = json.dumps(tree)
             if key not in self._made:
-                self._made[key] = _class(tree["class"]).from_dict(tree["dict"])
+                self._made[key] = _class(tree["class"], self._packages).from_dict(tree["dict"])
             return self._made[key]
-        return _class(tree["class"])(**{k: self.of(v) for k, v in tree["fields"].items()})
+        return _class(tree["class"], self._packages)(
+            **{k: self.of(v) for k, v in tree["fields"].items()}
+        )
 
 
 def _name(value: Any) -> str:
     return f"{type(value).__module__}:{type(value).__qualname__}"
 
 
-def _class(name: str) -> Any:
-    """Class with a given name; raises TypeError if it is not a record class of this package."""
+def _class(name: str, packages: Collection[str]) -> Any:
+    """Class with a given name; raises TypeError if it is not a record class of these packages."""
     module, _, qualified = name.partition(":")
-    cls = getattr(import_module(module), qualified, None) if module.startswith(PACKAGE) else None
+    known = module.partition(".")[0] in packages
+    cls = getattr(import_module(module), qualified, None) if known else None
     held = isinstance(cls, type) and (is_dataclass(cls) or hasattr(cls, "from_dict"))
     if not held or cls.__module__ != module:
-        raise TypeError(f"{name} is no class of this package's records")
+        raise TypeError(f"{name} is no class of the records of {', '.join(sorted(packages))}")
     return cls

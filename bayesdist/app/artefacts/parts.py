@@ -25,7 +25,9 @@ class Part:
 
     title: ClassVar[str]  # what a run lacks without it, for errors
     stage: ClassVar[str] = "fit"  # or "match": the stage that makes it
-    recorded: ClassVar[bool] = False  # stored in fit.h5, as a dataclass, rather than by `save`
+    # True for a dataclass of numbers, texts and arrays, which is stored in fit.h5 and restored by
+    # `read_stored_fit`; other parts are written by `save` and read by `load_fit` of their kind
+    recorded: ClassVar[bool] = False
     is_hierarchy: ClassVar[bool] = False  # exposures scatter about the solution of the fit
     applies_errors: ClassVar[bool] = False  # stars from `placed` have their errors already
 

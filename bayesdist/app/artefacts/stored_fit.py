@@ -23,6 +23,7 @@ from bayesdist.infer import (
     save_fit,
 )
 from bayesdist.infer.catalogue.added_errors import GroupedErrors
+from bayesdist.plugin import packages
 
 FIT, RECORD, MAGNITUDE_ERRORS = "fit.nc", "fit.h5", "magnitude_errors.ecsv"
 # artefacts of the stage 'fit' by their names in fit.h5, which holds parts as well
@@ -92,7 +93,7 @@ def hierarchy_of(fit: LinearFit, parts: Mapping[str, Part]) -> LinearFit | None:
 def _read_record(folder: Path) -> dict[str, Any]:
     """Content of fit.h5."""
     content = "what a fit rests on"
-    record = read_record(folder / RECORD, dict, content, do=FIT_AGAIN)
+    record = read_record(folder / RECORD, dict, content, do=FIT_AGAIN, packages=packages())
     with restoring(folder / RECORD, content, do=FIT_AGAIN):
         return {name: record[name] for name in (*RECORDED, "parts")}
 
