@@ -50,7 +50,6 @@ import numpy as np
 from bayesdist.app.kinds.kind import RunKind
 from bayesdist.app.artefacts.stars import set_aside
 from bayesdist.app.artefacts.parts import Part
-from bayesdist.app.artefacts.stored_fit import read_stored_fit
 from bayesdist.assess.terms.parameters import ScaleError
 from bayesdist.data import Matches
 from bayesdist.infer import GaussianPriors, build_model, fit_linear
@@ -61,14 +60,13 @@ from bayesdist.utils.checks import Check
 @dataclass(frozen=True)
 class Mask(Part):
     title = "mask"
+    recorded = True
 
     scale_sigma: float
 
-    def save(self, folder):
-        (folder / "mask.txt").write_text(repr(self.scale_sigma))
-
 
 class SpotsKind(RunKind):
+    has_catalogue = False
     words = Terminology(rows="spots", all_rows="spots", false_rows="false spots")
 
     def read(self, config, base):
@@ -98,11 +96,6 @@ class SpotsKind(RunKind):
             priors=GaussianPriors.none(model),
             parts={"mask": Mask(run.match_facts["scale_sigma"])},
         )
-
-    def load_fit(self, run):
-        stored = read_stored_fit(run.directory.path)
-        mask = Mask(float((run.directory / "mask.txt").read_text()))
-        return run.having(**stored | {"parts": {"mask": mask}})
 
     def error_terms(self, run, solution):
         sigma = run.part(Mask).scale_sigma
@@ -164,7 +157,6 @@ for words in (["run", "config.toml", "-o", "run", "-q"], ["stage", "evaluate", "
 def test_a_kind_of_another_package_is_run_and_continued(run):
     summary = json.loads((run / "summary.json").read_text())
     assert summary["kind"] == "spots" and summary["data"]["n_rows"] == 400
-    assert (run / "mask.txt").read_text() == repr(SCALE_SIGMA)
 
 
 def test_it_is_found_even_if_it_is_imported_first(run):
@@ -194,4 +186,4 @@ def test_its_words_and_checks_are_in_the_report(run):
     page = html.fromstring((run / "report.html").read_bytes())
     text = "".join(page.xpath("//body//text()[not(ancestor::script or ancestor::style)]"))
     assert "Scale of the mask" in text and "spots" in text and "false spots" in text
-    assert "matched stars" not in text
+    assert "matched stars" not in text and "reference catalogue" not in text

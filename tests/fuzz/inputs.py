@@ -17,7 +17,7 @@ from tests.app import layouts
 from tests.app.rvb_jobs import rvb_job, rvb_pairs, write_rvb_table
 from tests.app.support import as_table, good, simulated, write_config, write_job
 from tests.formats.test_ast import gbdes_table
-from tests.formats.test_formats import OPTIONS, SETTINGS, calibration_for
+from tests.formats.test_formats import OPTIONS, SETTINGS, SIZES, calibration_for
 from tests.formats.test_hst1pass import LIST
 from tests.formats.test_lookup_files import table as lookup_table
 from tests.fuzz.settings import CAMPAIGN, MATCHED, REQUIREMENTS
@@ -228,9 +228,6 @@ def _settings(folder: Path, run: Path) -> Iterator[Input]:
 # -- products -------------------------------------------------------------------------------------
 
 
-OF_STATED_SIZE = ("parameters", "idctab", "stdgdc", "wise_meta", "jwst", "roman")
-
-
 def _products(folder: Path) -> Iterator[Input]:
     for key, settings in SETTINGS.items():
         here = folder / key
@@ -244,7 +241,8 @@ def _products(folder: Path) -> Iterator[Input]:
         for one in files:
             shutil.copy(here / one.file_name, here / "whole" / one.file_name)
         (here / "stars.csv").write_text("x,y\n500,400\n600,500\n7,9\n")
-        size = [] if key in OF_STATED_SIZE else ["--size", "1200", "900"]
+        states_size = key in SIZES or "size" not in registry.format_of(key).asks
+        size = [] if states_size else ["--size", "1200", "900"]
         commands = {
             "inspect": ["inspect", f"@/{main}"],
             "compare": ["compare", f"@/{main}", f"@/whole/{main}", *size, "--grid", "9", "9"],

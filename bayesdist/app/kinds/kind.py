@@ -91,7 +91,9 @@ class RunKind(ABC, Generic[C, I]):
     # True if new exposures may be given as tables of matches; see `read_new_matches`
     reads_matches: ClassVar[bool] = False
     section: ClassVar[str] = ""  # section of summary.json on the matching
-    has_catalogue: ClassVar[bool] = True  # star positions come from a reference catalogue
+    # True if star positions come from a reference catalogue, whose error the user must state;
+    # else `error_terms` include the errors of the reference positions, if there are any
+    has_catalogue: ClassVar[bool] = True
     along_detector: ClassVar[bool] = False  # u and v are along the detector axes, not along the sky
 
     def source(self, directory: RunDirectory) -> RunInput | None:

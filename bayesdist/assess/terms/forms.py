@@ -1,18 +1,18 @@
-"""Forms in which errors are drawn; an error term uses one of them.
-
-Protocol of error terms: rows of a budget, draws, and error fields at positions.
+"""Protocol of error terms, and the forms in which their errors are drawn.
 
 A term is drawn once for all chips, epochs and questions. Its draws are evaluated at the positions
 of any domain. Terms are independent of each other: correlated errors must be one term with several
 rows.
 
-Errors of parameters: polynomials of the pixel position, for each chip and epoch.
+`draw` of a term returns one of these forms:
 
-Errors that are sums of arbitrary functions of the position.
-
-Errors that are independent between positions, and known displacements.
-
-Correlated rows of one term, which use the same draw number.
+- `Polynomials`: errors of parameters, polynomials of the pixel for each chip and epoch. If the
+  observer fits shift and rotation of an exposure, the part that this fit absorbs is subtracted from
+  these errors only;
+- `Functions`: sums of arbitrary functions of the position;
+- `Independent`: errors that are independent between positions;
+- `Known`: displacements, which are not errors;
+- `Together`: correlated rows of one term, which use the same draw number.
 """
 
 from __future__ import annotations

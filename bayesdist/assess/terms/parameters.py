@@ -1,9 +1,4 @@
-"""Errors of parameters: of a solution, of the catalogue, of a new exposure, of the scale.
-
-Errors of parameters: of the catalogue, of a new exposure, of scale and orientation.
-
-Errors of the parameters of a solution, split into parts.
-"""
+"""Errors of parameters: of a solution, of the catalogue, of a new exposure, of the scale."""
 
 from __future__ import annotations
 
@@ -154,7 +149,8 @@ class ScaleError:
         return Polynomials(self.rows[0], model, mean, mean[moving] + sizes * moved[moving])
 
 
-# error terms that a configuration row with a single sigma can create, by kind
+# error terms that a `[[budget]]` row with a single sigma can create, by kind; the unit of sigma is
+# defined by the term, since such rows have no unit
 ONE_SIZE: dict[str, Callable[..., ErrorTerm]] = {"scale": ScaleError, "rotation": ScaleError}
 
 

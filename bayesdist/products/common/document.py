@@ -183,7 +183,8 @@ class Format:
     parse : callable
         ``parse(content)`` returns the parsed file, or None if the `Content` is of another format.
     describe : callable
-        ``describe(parsed)`` returns lines of text that end with the `finding_lines`.
+        ``describe(parsed)`` returns lines of text: the first begins with the name of the file,
+        which `parse` therefore keeps, and the last ones are the `finding_lines`.
     lint : callable, optional
         ``lint(parsed)`` returns the findings. Formats without checks omit it.
     calibration : callable, optional
