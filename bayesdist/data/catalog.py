@@ -8,10 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from astropy.table import Table
 from numpy.typing import NDArray
 
 from bayesdist.data.covariances import LARGEST_RHO, with_correlations, without_sizes
 from bayesdist.data.reading.columns import is_on_sky, plane_unit, position_unit
+from bayesdist.data.reading.motions import with_prior_motions
 from bayesdist.data.reading.table import as_table, with_sky_columns
 from bayesdist.data.sky import (
     CORRELATIONS,
@@ -34,7 +36,7 @@ from bayesdist.data.tables.column import Quantities, SourceColumn, check_unit
 from bayesdist.data.tables.names import ALIASES, find_columns
 from bayesdist.errors import InputError
 from bayesdist.files.tables import read_table
-from bayesdist.utils.arrays import Float, Int
+from bayesdist.utils.arrays import Bool, Float, Int
 from bayesdist.utils.quantities import Direction, Epoch, direction_in, year_of
 
 _PAIRS = (("sigma_u", "sigma_v"), ("pm_u", "pm_v"), ("sigma_pm_u", "sigma_pm_v"))
@@ -81,6 +83,9 @@ class ReferenceCatalog:
     correlations : ndarray, shape (N, 5, 5), optional
         Correlation matrices of the errors of u, v, parallax, pm_u and pm_v. By default all errors
         are independent.
+    assumed_motion : ndarray of bool, shape (N,), optional
+        True for stars whose motion is not measured but taken from the others, with its error. By
+        default all motions are measured.
 
     Raises
     ------
@@ -113,6 +118,7 @@ class ReferenceCatalog:
     sigma_parallax: Float | None = None
     notes: tuple[str, ...] = ()
     correlations: Float | None = None
+    assumed_motion: Bool | None = None
 
     def __post_init__(self) -> None:
         check_unit(self.unit, where=self.source)
@@ -144,6 +150,14 @@ class ReferenceCatalog:
             )
         if self.correlations is not None:
             self._check_correlations(np.asarray(self.correlations, float))
+        if self.assumed_motion is not None:
+            object.__setattr__(self, "assumed_motion", np.asarray(self.assumed_motion, bool))
+            if np.shape(self.assumed_motion) != (n,):
+                raise InputError(
+                    f"assumed_motion does not have {n} values",
+                    where=self.source,
+                    do="give True or False for each star, or leave it out",
+                )
 
     def _check_correlations(self, correlations: Float) -> None:
         if self.sigma_u is None:
@@ -226,9 +240,17 @@ class ReferenceCatalog:
         arrays = {name: values[which] for name, values in columns_of(self, _COLUMNS).items()}
         if isinstance(self.epoch, np.ndarray):
             arrays["epoch"] = self.epoch[which]
-        if self.correlations is not None:
-            arrays["correlations"] = self.correlations[which]
+        for name in ("correlations", "assumed_motion"):
+            if getattr(self, name) is not None:
+                arrays[name] = getattr(self, name)[which]
         return replace(self, **arrays, star=self.star[which])
+
+    @property
+    def measured_motion(self) -> Bool:
+        """Mask (N,) of stars whose motion is measured; True if the catalogue has no motions."""
+        if self.assumed_motion is None:
+            return np.ones(len(self), bool)
+        return ~self.assumed_motion
 
     def by_code(self, *names: str) -> Float | None:
         """Columns (codes, n) of the catalogue, with a row per star code; None if any is missing."""
@@ -386,6 +408,7 @@ _NAME_PAIRS = (("u", "v"), ("ra", "dec"), *_PAIRS)
 # keys under which tables of matches know these quantities
 _ALSO = {"sigma_ra": "sigma_u", "sigma_dec": "sigma_v", "pm_ra": "pm_u", "pm_dec": "pm_v"}
 _ALSO |= {"sigma_pm_ra": "sigma_pm_u", "sigma_pm_dec": "sigma_pm_v", "catalogue_epoch": "epoch"}
+_IN_MATCHES = {key: name for name, key in _ALSO.items() if key != "epoch"}
 _MOTIONS = frozenset(("pm_u", "pm_v", "sigma_pm_u", "sigma_pm_v"))
 # missing values of these quantities count as 0
 _SPARED = frozenset(_PARALLAX) | CORRELATIONS
@@ -398,6 +421,7 @@ def read_catalog(
     unit: str | None = None,
     epoch: Epoch | None = None,
     tangent_point: Direction | None = None,
+    motion_prior: float | None = None,
 ) -> ReferenceCatalog:
     r"""Read a reference catalogue from a table file.
 
@@ -405,7 +429,7 @@ def read_catalog(
     ----------
     path : path-like
         .ecsv, .csv, .fits or .parquet file.
-    columns, unit, epoch, tangent_point
+    columns, unit, epoch, tangent_point, motion_prior
         As for `catalog_from_table`.
 
     Returns
@@ -433,6 +457,7 @@ def read_catalog(
         unit=unit,
         epoch=epoch,
         tangent_point=tangent_point,
+        motion_prior=motion_prior,
     )
 
 
@@ -444,6 +469,7 @@ def catalog_from_table(
     unit: str | None = None,
     epoch: Epoch | None = None,
     tangent_point: Direction | None = None,
+    motion_prior: float | None = None,
 ) -> ReferenceCatalog:
     """Reference catalogue from the columns of a table.
 
@@ -457,8 +483,7 @@ def catalog_from_table(
         `ReadOptions`; an empty name omits the quantity. With ra and dec, positions are projected to
         the tangent plane in arcsec. pm_u (pm_ra) is then the motion to the east, which includes the
         factor cos(dec); errors, motions and correlations are rotated to the axes of the plane; and
-        stars with a missing value, in most cases a missing motion, are left out. Missing
-        correlations count as 0.
+        stars with a missing value are left out. Missing correlations count as 0.
     source : str, optional
         Name of the file, for error messages.
     unit : str, optional
@@ -469,6 +494,10 @@ def catalog_from_table(
         Epoch of the positions, if the table has no such column.
     tangent_point : SkyCoord, or pair of float or Quantity, optional
         Tangent point. The default is the mean direction of the stars.
+    motion_prior : float, optional
+        Standard deviation on each axis, in mas per year, of the motions of stars without a measured
+        one. The default is the scatter of the other stars, if there are at least 30; with fewer,
+        and without errors of positions and motions, such stars are left out.
 
     Returns
     -------
@@ -499,25 +528,16 @@ def catalog_from_table(
         )
     unread = _unread(column_names, on_sky=on_sky)
     column_names = {key: name for key, name in column_names.items() if key not in unread}
-    notes: tuple[str, ...] = ()
-    rows = np.arange(len(table))
-    required = (
-        column_names
-        if on_sky
-        else {key: column_names[key] for key in _MOTIONS & column_names.keys()}
-    )
-    if required and len(table):
-        stay, counts = without_missing(
-            table, required, source=source, reject=False, spared=_SPARED, motions=_MOTIONS
-        )
-        table, rows = table[stay], rows[stay]
-        notes = tuple(f"{n} stars are left out: {reason}" for reason, n in counts.items())
-    quantities = Quantities(table, column_names, source, lambda index: row_number(int(rows[index])))
-    column = quantities.__getitem__
     if on_sky:
         base = plane_unit(unit, source=source)
     else:
-        base = position_unit((column("u"), column("v")), unit)
+        u, v = (Quantities(table, column_names, source)[key] for key in ("u", "v"))
+        base = position_unit((u, v), unit)
+    n_rows = len(table)
+    stars = _usable(table, column_names, source, base=base, motion_prior=motion_prior)
+    table, rows, notes = stars.table, stars.rows, stars.notes
+    quantities = Quantities(table, column_names, source, lambda index: row_number(int(rows[index])))
+    column = quantities.__getitem__
 
     def values(key: str, per_year: str = "") -> Float:
         if on_sky and column(key).unit is None:
@@ -542,15 +562,55 @@ def catalog_from_table(
         out["mag"] = column("mag").numbers()
     if "star" in column_names:
         out["star"] = _identities(column("star"))
-    elif notes:
+    elif len(rows) < n_rows:
         out["star"] = rows
     out["epoch"] = column("epoch").years() if "epoch" in column_names else epoch
+    out["assumed_motion"] = stars.assumed if stars.assumed.any() else None
     if not on_sky:
         if "rho_uv" in column_names:
             out["correlations"] = _of_positions(column("rho_uv"))
         return ReferenceCatalog(**out, unit=base, source=source, notes=notes)
     out |= {"unit": base, "source": source, "notes": notes}
     return _on_plane(quantities, out, point)
+
+
+@dataclass(frozen=True, eq=False)
+class _Usable:
+    """Rows of a table with all values that are needed."""
+
+    table: Table
+    rows: Int  # (N,), rows in the whole table
+    assumed: Bool  # (N,), True for motions from a prior
+    notes: tuple[str, ...]  # clauses on the others
+
+
+def _usable(
+    table: Table,
+    found: Mapping[str, str],
+    source: str,
+    *,
+    base: str,
+    motion_prior: float | None,
+) -> _Usable:
+    """Rows with all values that are needed; missing motions come from a prior if it can be made."""
+    on_sky = "ra" in found
+    filled = with_prior_motions(
+        table,
+        {_IN_MATCHES.get(key, key): name for key, name in found.items()},
+        source=source,
+        sigma_mas_yr=motion_prior,
+        reject=True,
+        unit=None if on_sky else base,
+    )
+    rows = np.arange(len(table))
+    needed = found if on_sky else {key: found[key] for key in _MOTIONS & found.keys()}
+    if not needed or not len(table):
+        return _Usable(filled.table, rows, filled.assumed, filled.notes)
+    stay, counts = without_missing(
+        filled.table, needed, source=source, reject=False, spared=_SPARED, motions=_MOTIONS
+    )
+    left_out = [f"{n} stars are left out: {reason}" for reason, n in counts.items()]
+    return _Usable(filled.table[stay], rows[stay], filled.assumed[stay], (*filled.notes, *left_out))
 
 
 def _unread(found: Collection[str], *, on_sky: bool) -> set[str]:

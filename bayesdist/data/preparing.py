@@ -73,6 +73,7 @@ def motion_error_line(catalog: ReferenceCatalog) -> MotionErrorLine:
     InputError
         If there are no magnitudes or no errors of the motions.
     """
+    catalog = catalog.select(catalog.measured_motion)
     sigma = _motion_errors(catalog)
     if catalog.mag is None:
         raise InputError(
@@ -105,7 +106,8 @@ def select_motions(catalog: ReferenceCatalog) -> ReferenceCatalog:
     Returns
     -------
     ReferenceCatalog
-        Stars at or below the line of `motion_error_line` on both axes, with their codes.
+        Stars at or below the line of `motion_error_line` on both axes, and those whose motion is
+        not measured but assumed with its error; with their codes.
 
     Raises
     ------
@@ -114,7 +116,7 @@ def select_motions(catalog: ReferenceCatalog) -> ReferenceCatalog:
     """
     line = motion_error_line(catalog)
     mag = required(catalog.mag, "proper motions are selected by magnitude")
-    return catalog.select(_motion_errors(catalog) <= line(mag))
+    return catalog.select((_motion_errors(catalog) <= line(mag)) | ~catalog.measured_motion)
 
 
 def _motion_errors(catalog: ReferenceCatalog) -> Float:

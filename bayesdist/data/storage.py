@@ -48,16 +48,30 @@ from bayesdist.data.reading.columns import (
     plane_unit,
     position_unit,
 )
+from bayesdist.data.reading.motions import (
+    NEEDED,
+    MotionPrior,
+    MovingStars,
+    doubtful_solutions,
+    unnamed_columns,
+    warn_of_zeros,
+)
 from bayesdist.data.reading.options import ReadArguments, ReadOptions, refuse_missing_errors
 from bayesdist.data.repeated import buckets_for, first_repetition
-from bayesdist.data.sky import direction_of, direction_sum, sky_columns, states_correlations
+from bayesdist.data.sky import (
+    MOTIONS,
+    direction_of,
+    direction_sum,
+    sky_columns,
+    states_correlations,
+)
 from bayesdist.data.tables.checks import columns_of, refuse_half
 from bayesdist.data.tables.column import Quantities, SourceColumn
 from bayesdist.data.tables.parquet import ParquetPart, RowBlock, describe_part
 from bayesdist.errors import FormatError, InputError
 from bayesdist.files.atomic import atomic_path, made_folder
 from bayesdist.files.parquet import HEADER, arrow_array
-from bayesdist.utils.arrays import Int
+from bayesdist.utils.arrays import Float, Int
 
 if TYPE_CHECKING:
     import pyarrow
@@ -65,6 +79,7 @@ if TYPE_CHECKING:
 PathLike = str | os.PathLike[str]
 Segment = tuple[int, int, int]  # file, first row, and row after the last
 BLOCK = 2**16  # rows read together
+STARS_OF_PRIOR = 200_000  # from which a prior of motions is made
 Labelled = tuple[Int, tuple[str, ...]]
 # columns, their units, and header values that no column holds
 Part = tuple[Mapping[str, NDArray[Any] | Labelled], Mapping[str, str], Mapping[str, Any]]
@@ -163,12 +178,6 @@ def open_matches(path: PathLike | Sequence[PathLike], **options: Unpack[ReadArgu
             where="data.plate_scale",
             do="write u, v and their errors in arcsec",
         )
-    if reading.motion_prior is not None:
-        raise InputError(
-            "stars of tables on disk get no motion from others",
-            where="data.motion_prior",
-            do="write the motions and their errors into the table",
-        )
     files = input_files(path)
     for file in files:
         if file.suffix.lower() != ".parquet":
@@ -194,6 +203,8 @@ def open_matches(path: PathLike | Sequence[PathLike], **options: Unpack[ReadArgu
         stored = [
             replace(part, options=replace(part.options, tangent_point=point)) for part in stored
         ]
+    if all(part.moves for part in stored):
+        stored = _with_motion_prior(stored, reading.motion_prior)
     labels = scan(stored)
     matches = Matches.from_readers(_readers(labels, stored), labels, _columns_of(first))
     return matches if isinstance(sigma, str) else matches.with_errors(sigma)
@@ -286,6 +297,14 @@ class StoredFile:
     exposure_name: str | None  # name of the single exposure, if there is no column of exposures
     options: ReadOptions  # with pixel origin, and with the tangent point once it is known
     notes: tuple[str, ...] = ()  # clauses on the file
+    motion_prior: MotionPrior | None = None  # of stars without a motion
+
+    @property
+    def moves(self) -> bool:
+        """True if positions are moved to the epochs of the exposures, with errors of motions."""
+        found, options = self.found, self.options
+        dated = "catalogue_epoch" in found or options.catalogue_epoch is not None
+        return found.keys() >= NEEDED and dated and ("epoch" in found or options.epoch is not None)
 
     @property
     def source(self) -> str:
@@ -313,10 +332,15 @@ class StoredFile:
         encoded = {column_names[key] for key in LABELS_OF_CODES if key in column_names}
         encoded |= {column_names["epoch"]} & self.part.texts if "epoch" in column_names else set()
         columns = list(dict.fromkeys(column_names.values()))
+        if self.motion_prior is not None:
+            columns += [name for name in self._of_motions() if name not in columns]
         # chip names get their numbers once all names are known
         options = replace(self.options, unit=self.unit, chips=self.options.chips or {})
         for block in self.part.blocks(columns, encoded=encoded, start=start, stop=stop, size=size):
-            out = match_columns(self._quantities(block, column_names), options)
+            quantities = self._quantities(block, column_names)
+            if self.motion_prior is not None:
+                quantities = self.motion_prior.filled(quantities)
+            out = match_columns(quantities, options)
             for key, labels in LABELS_OF_CODES.items():
                 if key not in column_names:
                     exposure_label = self.exposure_name if key == "exposure" else None
@@ -324,6 +348,19 @@ class StoredFile:
                         DEFAULT_LABELS[key] if exposure_label is None else exposure_label,
                     )
             yield out
+
+    def _of_motions(self) -> list[str]:
+        """Columns with motions and parallaxes, and those of which their prior depends."""
+        keys = (*MOTIONS, "parallax", "sigma_parallax", "mag")
+        names = [self.found[key] for key in keys if key in self.found]
+        return list(dict.fromkeys([*names, *unnamed_columns(self.part.colnames)]))
+
+    def moving_stars(self) -> Iterator[tuple[int, MovingStars]]:
+        """First row, and motions of the stars, block by block."""
+        for block in self.part.blocks(self._of_motions(), size=BLOCK):
+            stars = MovingStars.of(self._quantities(block, self.found), None)
+            if stars is not None:
+                yield block.first, stars
 
     def direction(self) -> tuple[int, int, int]:
         """Sum of the unit vectors of all reference positions, in the form of `direction_sum`."""
@@ -366,6 +403,36 @@ def stored_file(
         )
         plane_unit_ = position_unit((u, v), options.unit)
     return StoredFile(part, column_names, plane_unit_, exposure_name, options, notes)
+
+
+def _with_motion_prior(files: Sequence[StoredFile], sigma_mas_yr: float | None) -> list[StoredFile]:
+    """Files with a common prior on the motions of stars without a measured one.
+
+    It is made from about `STARS_OF_PRIOR` stars at equal distances, or from all if they are fewer.
+    There is none if all motions are measured, or too few.
+    """
+    step = max(1, sum(file.part.n_rows for file in files) // STARS_OF_PRIOR)
+    samples = list[dict[str, Float]]()
+    missing, zero, doubtful = (np.zeros(len(files), int) for _ in range(3))
+    for k, file in enumerate(files):
+        for first, stars in file.moving_stars():
+            stars.refuse_missing_errors()
+            samples.append(stars.measured(slice(-first % step, None, step)))
+            missing[k] += np.count_nonzero(stars.missing)
+            zero[k], doubtful[k] = zero[k] + stars.n_zero, doubtful[k] + stars.n_doubtful
+    prior = None
+    if samples and missing.any():
+        prior = MotionPrior.of(samples, sigma_mas_yr, unit=None, source=files[0].source)
+    out = []
+    for k, file in enumerate(files):
+        n, notes = file.part.n_rows, [*file.notes]
+        notes += doubtful_solutions(int(doubtful[k]), file.part.n_rows)
+        if prior is not None and missing[k]:
+            notes.append(prior.note(int(missing[k]), n))
+            names = [file.found[key] for key in MOTIONS[:2]]
+            warn_of_zeros(names, int(zero[k]), n, file.source)
+        out.append(replace(file, motion_prior=prior, notes=tuple(notes)))
+    return out
 
 
 def tangent_point_of(parts: Sequence[StoredFile]) -> tuple[float, float]:

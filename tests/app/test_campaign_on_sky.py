@@ -435,19 +435,40 @@ def test_usual_names_and_an_epoch_from_the_configuration(tmp_path):
     assert np.mean(pulls**2) == pytest.approx(1.0, abs=4 * np.sqrt(2 * len(DATES) / pulls.size))
 
 
-def test_stars_without_a_motion_are_left_out_and_counted(tmp_path):
+def without_motions(which):
+    """Change of a catalogue in which the motions and parallaxes of some stars are missing."""
+
     def change(table):
         for name in ("pmra", "pmdec", "pmra_error", "pmdec_error", "parallax", "parallax_error"):
-            table[name] = np.ma.masked_array(table[name], np.arange(len(table)) < 30)
+            table[name] = np.ma.masked_array(table[name], which(np.arange(len(table))))
         table["parallax"][40:50] = np.ma.masked  # a parallax that is not known is none
         return table
 
-    config = write(tmp_path / "in", -1, change=change)
+    return change
+
+
+def test_stars_without_a_motion_have_that_of_the_others_with_its_error(tmp_path):
+    """A third of them, at dates of up to seven years from the catalogue."""
+    config = write(tmp_path / "in", -1, change=without_motions(lambda row: row % 3 == 0))
     text = good("check", config).out
-    assert "870 of 870 stars" in text and "30 stars are left out: no proper motion" in text
+    assert "900 of 900 stars" in text and "300 of 900 rows have no motion" in text
     run = staged(config, "match")
-    star = read_matches(run / "pairs", unit="arcsec").star
-    assert star.min() >= 30 and np.isin(np.arange(40, 50), star).any()
+    pairs, pulls = read_matches(run / "pairs", unit="arcsec"), pulls_of_pairs(run, -1)
+    assumed = pairs.star % 3 == 0
+    assert assumed.sum() > 0.28 * len(pairs)
+    assert np.median(pairs.sigma_u[assumed]) > 3 * np.median(pairs.sigma_u[~assumed])
+    # a star has one motion in all exposures: some 300 independent errors on each axis
+    assert np.sqrt(np.mean(pulls[:, assumed] ** 2)) == pytest.approx(1.0, abs=0.15)
+    prior = write(tmp_path / "given", -1, change=without_motions(lambda row: row % 3 == 0),
+                  motion_prior=40.0)  # fmt: skip
+    wide = read_matches(staged(prior, "match") / "pairs", unit="arcsec")
+    years = np.abs(wide.epoch - CATALOGUE)[wide.star % 3 == 0]
+    np.testing.assert_allclose(wide.sigma_u[wide.star % 3 == 0], 0.040 * years, rtol=0.05)
+
+
+def test_stars_without_a_motion_are_left_out_and_counted_if_others_are_few(tmp_path):
+    config = write(tmp_path / "in", -1, change=without_motions(lambda row: row >= 25))
+    assert "875 stars are left out: no proper motion" in good("check", config).out
 
 
 def on_a_plane(unit):

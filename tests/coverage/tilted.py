@@ -2,11 +2,12 @@
 
 `python -m tests.coverage.tilted RESULTS.jsonl --truths 200` makes the table of docs/validation.md.
 
-Two kinds of stars, of which the map is a polynomial of the fitted order:
+Three kinds of stars, of which the map is a polynomial of the fitted order:
 
 - ellipses: errors of the matches have a correlation of 0.9, as those of elongated images;
 - motions: a catalogue like Gaia's, with covariances (5, 5) of position, parallax and motion that
-  are alike over the field (as by a scanning law), ten years before the exposure.
+  are alike over the field (as by a scanning law), ten years before the exposure;
+- unmeasured: the same, but a third of the stars has no motion and no parallax.
 
 Each truth is processed with its covariances, and again without the correlations.  Errors of
 positions over the detector are compared with the stated ones along u and v, and along and across
@@ -19,7 +20,7 @@ import argparse
 import json
 import logging
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -123,7 +124,17 @@ def motions(seed: int) -> Truth:
     return Truth(table, options, tuple(names), true_map, long_axis(at_epoch), exact)
 
 
-KINDS = {"ellipses": ellipses, "motions": motions}
+def unmeasured(seed: int) -> Truth:
+    """As `motions`, but a third of the stars has no motion and no parallax."""
+    truth = motions(seed)
+    table, gone = dict(truth.table), np.arange(STARS) % 3 == 0
+    for name in PARAMETERS[2:]:
+        for column in (name, f"{name}_error"):
+            table[column] = np.where(gone, np.nan, table[column])
+    return replace(truth, table=table)
+
+
+KINDS = {"ellipses": ellipses, "motions": motions, "unmeasured": unmeasured}
 
 
 def _catalogue_covariances(rng: np.random.Generator) -> np.ndarray:

@@ -184,8 +184,10 @@ def test_the_gaia_extract(data_dir):
     c = read_catalog(data_dir / "flystar" / "my_gaia.fits", unit="arcsec")
     # stars with two parameters have no parallax, and 0 in the columns of motions and their errors
     parallax = Table.read(data_dir / "flystar" / "my_gaia.fits")["parallax"]
-    assert len(c) == np.count_nonzero(~parallax.mask) == 506
+    np.testing.assert_array_equal(c.assumed_motion, parallax.mask)
+    assert len(c) == 815 and np.count_nonzero(parallax.mask) == 309
     assert np.all(c.epoch == 2015.5) and c.pm_u is not None
-    assert c.notes == ("309 stars are left out: proper motion of exactly 0",)
+    assert "309 of 815 rows have no motion" in c.notes[0]
+    assert c.sigma_pm_u[c.assumed_motion].min() > 1e-3 > np.median(c.sigma_pm_u[~c.assumed_motion])
     with pytest.raises(InputError, match="has no unit"):
         read_catalog(data_dir / "flystar" / "my_gaia.fits")

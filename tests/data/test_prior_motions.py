@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
+import pyarrow
+import pyarrow.parquet as pq
 import pytest
-from astropy.table import MaskedColumn
+from astropy.table import MaskedColumn, Table
+from astropy.wcs import WCS
 
 import bayesdist as bd
+from bayesdist.data import catalog_from_table
+from bayesdist.data.preparing import motion_error_line, select_motions
 from bayesdist.errors import InputError
 from tests.data.test_sky import POINT, catalogue, read
 from tests.reduced import FULL
@@ -117,13 +122,23 @@ def test_doubtful_solutions_are_counted():
 
 # -- coverage -------------------------------------------------------------------------------------
 
-TRUTHS = 600 if FULL else 60
+TRUTHS = 200 if FULL else 60
 PROBES = np.array([[200.0, 300.0], [850.0, 700.0]])
 
 
-def fitted(t, **options):
+def of_catalogue(t):
+    """Matches of a table by the positions and errors that a campaign takes from its catalogue."""
+    then = catalog_from_table(t, tangent_point=POINT).as_seen(EPOCH)
+    x, y = (np.asarray(t[name])[then.star] for name in ("x", "y"))
+    return bd.Matches(x, y, then.u, then.v, unit="arcsec", **then.position_errors)
+
+
+WAYS = {"table": lambda t: read(t, epoch=EPOCH), "catalogue": of_catalogue}
+
+
+def fitted(t, way="table"):
     """Fit to the stars of a table with their own errors, as positions (2, 2) and errors of u."""
-    stars = read(t, epoch=EPOCH, **options)
+    stars = WAYS[way](t)
     model = bd.build_model(stars, order=1, size=(1000, 1000))
     fit = bd.fit_linear(stars, model)
     phi = fit.model.basis().evaluate(*PROBES.T)
@@ -134,7 +149,7 @@ def fitted(t, **options):
 @pytest.mark.slow
 def test_a_third_of_the_stars_without_motions_is_covered():
     """Least squares, 12 years from the catalogue: neither left out nor believed to stand still."""
-    z = {"prior": [], "standing still": []}
+    z = {"table": [], "catalogue": [], "standing still": []}
     for seed in range(TRUTHS):
         rng = np.random.default_rng([7, seed])
         t, _ = field(150, seed)
@@ -161,10 +176,145 @@ def test_a_third_of_the_stars_without_motions_is_covered():
         for name in ("pmra", "pmdec"):
             still[name][gone] = 1e-9
         expected = model.basis().evaluate(*PROBES.T) @ truth.reshape(2, -1).T
-        for kind, table in (("prior", masked(t, gone)), ("standing still", still)):
-            found, sigma = fitted(table)
+        for kind in z:
+            table = still if kind == "standing still" else masked(t, gone)
+            found, sigma = fitted(table, kind if kind in WAYS else "table")
             z[kind] += list((found - expected)[:, 0] / sigma)
     within = {kind: [np.mean(np.abs(v) < k) for k in (1.0, 1.96)] for kind, v in z.items()}
     spread = 4 * np.sqrt(0.25 / (2 * TRUTHS))
-    assert within["prior"] == pytest.approx([0.683, 0.95], abs=spread)
+    print(within)
+    for way in WAYS:
+        assert within[way] == pytest.approx([0.683, 0.95], abs=spread), way
     assert within["standing still"][1] < 0.3
+
+
+# -- catalogues and tables on disk ----------------------------------------------------------------
+
+
+def two_thirds(n=900, **options):
+    """A table, which stars lack a motion, and the reference catalogue that is read from it."""
+    t, _ = field(n)
+    gone = third(n)
+    return t, gone, catalog_from_table(masked(t, gone), tangent_point=POINT, **options)
+
+
+def test_catalogues_have_the_motions_and_errors_of_tables_of_matches():
+    t, gone, c = two_thirds()
+    m = read(masked(t, gone), epoch=EPOCH)
+    then = c.at(EPOCH)
+    np.testing.assert_array_equal(c.assumed_motion, gone)
+    assert any("300 of 900 rows have no motion" in note for note in c.notes)
+    # without the parallaxes' errors, which depend on the date in the year
+    np.testing.assert_allclose(then.sigma_u, m.sigma_u, atol=3e-5)
+    assert np.median(then.sigma_u[gone]) > 20 * np.median(then.sigma_u[~gone])
+    years = np.array([0.0, 5.0, 20.0])
+    growing = [np.median(c.at(2016.0 + dt).sigma_u[gone]) for dt in years]
+    sizes = np.median(c.sigma_pm_u[gone]) * years
+    np.testing.assert_allclose(growing, np.hypot(0.05e-3, sizes), rtol=0.3)
+    given = two_thirds(motion_prior=40.0)[2]
+    np.testing.assert_allclose(given.sigma_pm_u[gone], 0.040, rtol=1e-5)  # of a tangent plane
+    few = catalog_from_table(masked(t, np.arange(900) >= 10), tangent_point=POINT)
+    assert len(few) == 10 and few.assumed_motion is None
+
+
+@pytest.mark.parametrize("unit", ["mas", "pix"])
+def test_catalogues_on_a_plane_have_them_in_their_unit(unit):
+    rng = np.random.default_rng(3)
+    n, gone = 300, third(300)
+    t = Table({"u": rng.uniform(0, 1e5, n), "v": rng.uniform(0, 1e5, n), "sigma_u": np.ones(n)})
+    t["sigma_v"] = 1.0
+    for name in ("pm_u", "pm_v"):
+        t[name] = MaskedColumn(rng.normal(2.0, 5.0, n), mask=gone)
+    t["sigma_pm_u"] = t["sigma_pm_v"] = MaskedColumn(np.full(n, 0.1), mask=gone)
+    c = catalog_from_table(t, unit=unit, epoch=2016.0)
+    assert c.pm_u[gone] == pytest.approx(np.median(c.pm_u[~gone]))
+    assert c.sigma_pm_u[gone] == pytest.approx(np.std(c.pm_u[~gone]), rel=0.2)
+    if unit == "pix":
+        with pytest.raises(InputError, match="in mas/yr, and positions are in pix"):
+            catalog_from_table(t, unit=unit, epoch=2016.0, motion_prior=5.0)
+    else:
+        given = catalog_from_table(t, unit=unit, epoch=2016.0, motion_prior=5.0)
+        assert given.sigma_pm_v[gone] == pytest.approx(5.0)
+
+
+def test_reliable_motions_are_selected_among_the_measured_ones():
+    c = two_thirds()[2]
+    line = motion_error_line(c)
+    measured = c.select(c.measured_motion)
+    np.testing.assert_array_equal(line.sigma, motion_error_line(measured).sigma)
+    assert select_motions(c).assumed_motion.sum() == 300
+
+
+def seen_table(t, rng):
+    """Detections of the stars of a table, with errors of the centroids."""
+    m = read(t, epoch=EPOCH)
+    x, y = m.u / 0.05 + rng.normal(0, 0.02, len(m)), m.v / 0.05 + rng.normal(0, 0.02, len(m))
+    wcs = WCS(naxis=2)
+    wcs.wcs.ctype, wcs.wcs.crval = ["RA---TAN", "DEC--TAN"], POINT
+    wcs.wcs.crpix, wcs.wcs.cdelt = [0.0, 0.0], [0.05 / 3600] * 2
+    detections = Table({"x": x, "y": y})
+    detections["x_err"] = detections["y_err"] = 0.02
+    return detections, wcs
+
+
+def test_match_gives_them_errors_unless_errors_of_the_matches_are_given(rng):
+    t, _ = field()
+    gone = third(len(t))
+    detections, wcs = seen_table(t, rng)
+    options = {"radius": 0.5, "wcs": wcs, "epoch": EPOCH}
+    m = bd.match(detections, masked(t, gone), **options)
+    assert gone[m.star].sum() > 0.9 * gone.sum()
+    size = np.median(m.sigma_u[gone[m.star]])
+    assert size > 10 * np.median(m.sigma_u[~gone[m.star]])
+    for how in ({"sigma": 0.01}, {"whole": True}):
+        seen = detections.copy()
+        if how.pop("whole", False):
+            seen["sigma_u"] = seen["sigma_v"] = 0.001
+        assert not gone[bd.match(seen, masked(t, gone), **options, **how).star].any()
+    wide = bd.match(detections, masked(t, gone), **options, motion_prior=30.0)
+    assert wide.sigma_u[gone[wide.star]] == pytest.approx(YEARS * 0.030, rel=0.01)
+
+
+def test_match_table_leaves_them_out(rng):
+    _, gone, c = two_thirds()
+    then = c.at(EPOCH)
+    seen = bd.Matches(then.u * 20, then.v * 20, then.u + 1.0, then.v, unit="arcsec",
+                      epoch=np.full(len(c), EPOCH))  # fmt: skip
+    assert not gone[bd.match_table(seen, c).star].any()
+
+
+@pytest.mark.parametrize("how", ["masked", "zeros"])
+def test_tables_on_disk_give_the_matches_of_tables_in_memory(how, tmp_path):
+    t, _ = field(700)
+    gone = third(700)
+    stored = masked(t, gone)
+    if how == "zeros":
+        stored = t.copy()
+        stored["pmra"][gone] = stored["pmdec"][gone] = 0.0
+    stored["ruwe"] = np.where(np.arange(700) < 5, 2.0, 1.0)
+    # NaN becomes null
+    pq.write_table(pyarrow.Table.from_pandas(stored.to_pandas()), tmp_path / "stars.parquet")
+    options = {"epoch": EPOCH, "tangent_point": POINT}
+    memory = bd.read_matches(tmp_path / "stars.parquet", **options)
+    disk = bd.open_matches(tmp_path / "stars.parquet", **options)
+    for batch in disk.batches():
+        for name in ("u", "v", "sigma_u", "sigma_v", "rho_uv"):
+            np.testing.assert_array_equal(getattr(batch, name), getattr(memory, name))
+    said = [note for note in memory.notes if "ruwe" in note or "no motion" in note]
+    assert len(said) == 2 and set(said) <= set(disk.notes)
+    wide = bd.open_matches(tmp_path / "stars.parquet", **options, motion_prior=40.0)
+    sigma = np.concatenate([batch.sigma_u for batch in wide.batches()])
+    assert sigma[gone] == pytest.approx(YEARS * 0.040, rel=0.01)
+
+
+def test_a_prior_without_errors_that_grow_is_refused():
+    t, _ = field(60)
+    with pytest.raises(InputError, match=r"motion_prior is given, and sigma is 0\.01"):
+        read(t, epoch=EPOCH, motion_prior=5.0, sigma=0.01)
+    gone = third(60)
+    assert read(masked(t, gone), epoch=EPOCH, sigma=0.01).rejected == {"no proper motion": 20}
+    run = {"order": 1, "size": (1000, 1000), "settings": {"data": {"epoch": EPOCH}}}
+    now = read(t, epoch=EPOCH)
+    noise = np.random.default_rng(1).normal(0, 0.1, (2, len(t)))
+    t["x"], t["y"] = 3 * np.stack([now.u, now.v]) + 500 + noise
+    assert len(bd.calibrate(masked(t, gone), sigma=0.01, **run).matches) == 40

@@ -195,8 +195,8 @@ def test_motions_of_exactly_zero_are_missing_values_on_a_plane(tmp_path):
     assert found.u.tolist() == [1.0, 3.0]
 
 
-def test_motions_of_exactly_zero_are_refused_in_tables_on_disk(tmp_path):
-    t = catalogue()
+def test_motions_of_exactly_zero_are_refused_in_tables_on_disk_with_few_stars(tmp_path):
+    t = catalogue(20)
     for name, unit in {"ra": "deg", "dec": "deg", "pmra": "mas / yr", "pmdec": "mas / yr"}.items():
         t[name].unit = unit
     t.remove_columns(["parallax", "parallax_error"])

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -42,6 +42,7 @@ from bayesdist.data.matching.similarity import (
 )
 from bayesdist.data.reading.centroids import with_variances
 from bayesdist.data.reading.columns import CENTROIDS
+from bayesdist.data.reading.motions import with_prior_motions
 from bayesdist.data.reading.options import ReadOptions
 from bayesdist.data.reading.table import (
     SKY_COLUMN,
@@ -113,6 +114,7 @@ def match(
     tangent_point: Direction | None = None,
     chips: Mapping[str, int] | None = None,
     not_finite: str = "refuse",
+    motion_prior: float | None = None,
 ) -> Matches:
     """Match detections with a catalogue on the sky.
 
@@ -137,8 +139,10 @@ def match(
         have columns of ra and dec.
     columns, catalogue_columns : mapping of str to str, optional
         Column of each quantity in the two tables, as for `ReadOptions`.
-    sigma, epoch, catalogue_epoch, pixel_origin, tangent_point, chips, not_finite
-        As for `ReadOptions`. The default tangent point is the mean direction of the detections.
+    sigma, epoch, catalogue_epoch, pixel_origin, tangent_point, chips, not_finite, motion_prior
+        As for `ReadOptions`. Stars without a motion are also left out if the detections have
+        sigma_u and sigma_v, which are the whole errors of the matches. The default tangent point is
+        the mean direction of the detections.
 
     Returns
     -------
@@ -177,8 +181,11 @@ def match(
     options = ReadOptions(
         None, None, sigma, pixel_origin, tangent_point, epoch, catalogue_epoch, chips, not_finite
     )
-    stars = _reference(catalogue, catalogue_columns, options)
+    if motion_prior is not None:
+        options = replace(options, motion_prior=motion_prior)
     rough_detections = _detections(detections, columns, wcs, options)
+    grows = options.read_sigma and "sigma_u" not in rough_detections.columns
+    stars = _reference(catalogue, catalogue_columns, options, fill_motions=grows)
     point = options.tangent_point or mean_direction(rough_detections.ra, rough_detections.dec)
     collected = _Found(rough_detections, stars)
     for group in rough_detections.groups():
@@ -318,8 +325,18 @@ def _sky_table_of(catalogue: ReferenceCatalog) -> QTable:
     return table
 
 
-def _reference(catalogue: Any, columns: Mapping[str, str] | None, options: ReadOptions) -> _Stars:
-    """Catalogue stars with the quantities that are used."""
+def _reference(
+    catalogue: Any,
+    columns: Mapping[str, str] | None,
+    options: ReadOptions,
+    *,
+    fill_motions: bool,
+) -> _Stars:
+    """Catalogue stars with the quantities that are used.
+
+    With `fill_motions`, stars without a motion get one from a prior if one can be made; otherwise
+    they are left out.
+    """
     table = _catalogue_table(catalogue)
     column_names = find_columns(
         table.colnames, columns, ALIASES, source=CATALOGUE, pairs=PAIRS, needed=("ra", "dec")
@@ -336,6 +353,12 @@ def _reference(catalogue: Any, columns: Mapping[str, str] | None, options: ReadO
             do="give catalogue_epoch, or leave the motions out: "
             'catalogue_columns={"pm_ra": "", "pm_dec": ""}',
         )
+    of_motions: tuple[str, ...] = ()
+    if moving and fill_motions:
+        filled = with_prior_motions(
+            table, column_names, source=CATALOGUE, sigma_mas_yr=options.motion_prior, reject=True
+        )
+        table, of_motions = filled.table, filled.notes
     read = {key: name for key, name in column_names.items() if key in ("ra", "dec", *MOTIONS)}
     stay, counts = without_missing(
         table,
@@ -346,7 +369,8 @@ def _reference(catalogue: Any, columns: Mapping[str, str] | None, options: ReadO
         motions=frozenset(MOTIONS),
     )
     rows = np.flatnonzero(stay)
-    notes = tuple(f"{n} catalogue stars are left out: {reason}" for reason, n in counts.items())
+    left_out = [f"{n} catalogue stars are left out: {reason}" for reason, n in counts.items()]
+    notes = (*of_motions, *left_out)
     quantities = Quantities(table[rows], column_names, CATALOGUE, names=table.colnames)
     mag = None
     if "mag" in column_names:

@@ -186,7 +186,8 @@ def match_table(
     -------
     Matches
         Matched stars with u, v and star codes of the catalogue; the others are counted as rejected.
-        Errors are unchanged, because those of a catalogue are only a part of the error of a match.
+        Errors are unchanged, because those of a catalogue are only a part of the error of a match;
+        stars of the catalogue whose motion is not measured but assumed are therefore not used.
 
     Raises
     ------
@@ -217,6 +218,7 @@ def match_table(
             where=location,
             do="give the epoch of the exposures",
         )
+    catalog = catalog.select(catalog.measured_motion)
     u, v = table.u.copy(), table.v.copy()
     star = np.zeros(len(table), np.int64)
     matched = np.zeros(len(table), bool)

@@ -8,7 +8,8 @@ so that the error of its position grows with the time from the epoch of the cata
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,8 @@ from astropy.table import Column, Table
 
 from bayesdist.data.sky import CORRELATIONS, MOTIONS
 from bayesdist.data.tables.checks import absent, row_number, zero_motions
-from bayesdist.data.tables.column import Quantities
+from bayesdist.data.tables.column import EncodedColumn, Quantities, TableColumns
+from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Bool, Float
 
 log = logging.getLogger("bayesdist")
@@ -26,7 +28,31 @@ PER_BIN = 60  # stars of a bin of magnitudes
 MOST_BINS = 5
 TWO_PARAMETERS = 3  # astrometric_params_solved of Gaia's solutions of the position alone
 DOUBTFUL_RUWE = 1.4  # above it Gaia's documentation doubts that a star is single
-ARCSEC_PER_MAS = 1e-3
+SOLVED, G_MAGNITUDE, RUWE = "astrometric_params_solved", "phot_g_mean_mag", "ruwe"
+ON_SKY = "arcsec"  # unit in which motions of positions on the sky are compared
+MAS = {"arcsec": 1e3, "mas": 1.0, "deg": 3.6e6}
+# quantities that a prior fills, and what their unit has after that of positions
+FILLED = {"pm_ra": " / yr", "pm_dec": " / yr", "parallax": ""}
+NEEDED = {"sigma_ra", "sigma_dec", *MOTIONS}  # quantities without which there is no prior
+
+
+@dataclass(frozen=True, eq=False)
+class Filled:
+    """Table in which stars without a motion have one from a prior.
+
+    Parameters
+    ----------
+    table : Table
+        The table itself if it has no such stars, or no prior can be made.
+    assumed : ndarray of bool, shape (N,)
+        True for stars whose motion is from the prior.
+    notes : tuple of str
+        Clauses about them, and about stars with a doubtful solution.
+    """
+
+    table: Table
+    assumed: Bool
+    notes: tuple[str, ...] = ()
 
 
 def with_prior_motions(
@@ -36,13 +62,14 @@ def with_prior_motions(
     source: str,
     sigma_mas_yr: float | None,
     reject: bool,
-) -> tuple[Table, tuple[str, ...]]:
-    """Table in which stars without a motion have one from a prior, and notes on them.
+    unit: str | None = None,
+) -> Filled:
+    """Give stars without a measured motion one from a prior.
 
     Parameters
     ----------
     table : Table
-        Table with sky positions.
+        Table with catalogue positions.
     found : mapping of str to str
         Column of each quantity.
     source : str
@@ -51,146 +78,322 @@ def with_prior_motions(
         Standard deviation of the prior on each axis; by default that of the other stars.
     reject : bool
         True if rows with errors that are not finite are left out later, False to refuse them.
+    unit : str or None
+        Unit of positions on a plane, which that of columns without a unit is; None for positions on
+        the sky, where columns must have a unit.
 
     Returns
     -------
-    Table
-        The table itself if it has no errors of positions and motions, no such stars, or too few
-        stars with a motion to make a prior.
-    tuple of str
+    Filled
+        With the unchanged table if it has no errors of positions and motions, no such stars, or too
+        few stars with a motion to make a prior.
 
     Raises
     ------
     InputError
-        If a star with a motion has no error of it.
+        If a star with a motion has no error of it, or if a prior is given and the unit of positions
+        is no angle.
     """
-    if not {"sigma_ra", "sigma_dec", *MOTIONS} <= found.keys():
-        return table, ()
-    zero = zero_motions(table[found["pm_ra"]], table[found["pm_dec"]])
-    missing = zero | _without_solution(table)
-    for key in MOTIONS[:2]:
-        missing |= absent(table[found[key]], not_finite=True)
-    quantities = Quantities(table, found, source, row_number)
-    if any(quantities[key].unit is None for key in MOTIONS):
-        return table, ()  # refused in reading
+    unchanged = Filled(table, np.zeros(len(table), bool))
+    if not found.keys() >= NEEDED:
+        return unchanged
+    stars = MovingStars.of(Quantities(table, found, source, row_number), unit)
+    if stars is None:
+        return unchanged
     if not reject:
-        _refuse_missing_errors(quantities, ~missing)
-    notes = _doubtful(table)
-    enough = np.count_nonzero(~missing) >= MIN_STARS
-    if not missing.any() or not (enough or sigma_mas_yr is not None):
-        return table, notes
-    if zero.any():
+        stars.refuse_missing_errors()
+    notes = doubtful_solutions(stars.n_doubtful, len(table))
+    prior = MotionPrior.of([stars.measured()], sigma_mas_yr, unit=unit, source=source)
+    if prior is None or not stars.missing.any():
+        return replace(unchanged, notes=notes)
+    warn_of_zeros([found[key] for key in MOTIONS[:2]], stars.n_zero, len(table), source)
+    out = table.copy(copy_data=False)
+    for name, column in prior.columns(stars).items():
+        out[name] = column
+    note = prior.note(int(stars.missing.sum()), len(table))
+    return Filled(out, stars.missing, (*notes, note))
+
+
+@dataclass(frozen=True, eq=False)
+class MovingStars:
+    """Motions and parallaxes of stars of a table, or of a block of its rows."""
+
+    quantities: Quantities
+    missing: Bool  # (N,), True for stars without a measured motion
+    n_zero: int  # stars with a motion of exactly 0 on both axes
+    n_doubtful: int  # stars whose solution Gaia's documentation doubts
+    magnitude: Float  # (N,), NaN if unknown
+    # quantities with an error, and the factors from the columns to the unit of positions
+    factors: Mapping[str, tuple[float, float]]
+
+    @classmethod
+    def of(cls, quantities: Quantities, unit: str | None) -> MovingStars | None:
+        """Stars of a table; None if a motion has no unit and needs one, which reading refuses.
+
+        `unit` is as for `with_prior_motions`.
+        """
+        table, found = quantities.table, quantities.found
+        columns = {key: quantities[key] for key in MOTIONS}
+        if unit is None and any(column.unit is None for column in columns.values()):
+            return None
+        zero = zero_motions(*(_plain(columns[key].values) for key in MOTIONS[:2]))
+        missing = zero | _without_solution(table)
+        for key in MOTIONS[:2]:
+            missing |= absent(_plain(columns[key].values), not_finite=True)
+        factors = {}
+        for key, per_year in FILLED.items():
+            names = (key, f"sigma_{key}")
+            if not found.keys() >= set(names):
+                continue
+            pair = [quantities[name] for name in names]
+            if unit is not None or all(column.unit is not None for column in pair):
+                first, second = (column.factor((unit or ON_SKY) + per_year) for column in pair)
+                factors[key] = first, second
+        return cls(
+            quantities,
+            missing,
+            int(np.count_nonzero(zero)),
+            _n_doubtful(table),
+            _magnitudes(table, found),
+            factors,
+        )
+
+    def refuse_missing_errors(self) -> None:
+        """Raise InputError for a measured motion without an error."""
+        for key in MOTIONS[2:]:
+            column = self.quantities[key]
+            bad = ~self.missing & absent(_plain(column.values), not_finite=True)
+            if bad.any():
+                raise column.fail(int(np.argmax(bad)), "a measured proper motion has no error")
+
+    def measured(self, rows: slice = slice(None)) -> dict[str, Float]:
+        """Measured values and magnitudes (2, n) of each quantity, in the unit of positions.
+
+        `rows` selects a part of the stars.
+        """
+        out = {}
+        for key, (factor, _) in self.factors.items():
+            column = self.quantities[key]
+            values = factor * column.numbers_or(0.0)
+            lacks = self.missing | absent(_plain(column.values), not_finite=True)
+            out[key] = np.stack([values, self.magnitude])[:, rows][:, ~lacks[rows]]
+        return out
+
+
+@dataclass(frozen=True, eq=False)
+class MotionPrior:
+    """Normal distributions of motions and parallaxes by magnitude.
+
+    Parameters
+    ----------
+    distributions : mapping of str to Distribution
+        Distribution of each quantity in the unit of positions (per year).
+    sigma : float or None
+        Standard deviation of motions that replaces those of the distributions.
+    unit : str or None
+        As for `with_prior_motions`.
+    """
+
+    distributions: Mapping[str, Distribution]
+    sigma: float | None
+    unit: str | None
+
+    @property
+    def mas(self) -> float | None:
+        """Milliarcseconds in the unit of positions; None if that is no angle."""
+        return MAS.get(self.unit or ON_SKY)
+
+    @classmethod
+    def of(
+        cls,
+        parts: Sequence[Mapping[str, Float]],
+        sigma_mas_yr: float | None,
+        *,
+        unit: str | None,
+        source: str,
+    ) -> MotionPrior | None:
+        """Prior from measured values; None if they are too few and no prior is given.
+
+        `parts` are those of `MovingStars.measured` for parts of a table.
+        """
+        mas = MAS.get(unit or ON_SKY)
+        if sigma_mas_yr is not None and mas is None:
+            raise InputError(
+                f"a prior of motions is given in mas/yr, and positions are in {unit}",
+                where=source,
+                do="give positions in an angle, or leave motion_prior out",
+            )
+        distributions = {}
+        for key in FILLED:
+            if all(key in part for part in parts):
+                values, magnitude = np.concatenate([part[key] for part in parts], axis=1)
+                distributions[key] = Distribution.of(values, magnitude)
+                if key in MOTIONS and len(values) < MIN_STARS and sigma_mas_yr is None:
+                    return None
+        sigma = None if sigma_mas_yr is None or mas is None else sigma_mas_yr / mas
+        return cls(distributions, sigma, unit)
+
+    def columns(self, stars: MovingStars) -> dict[str, Column]:
+        """Columns by name in which stars without a motion have that of the prior."""
+        quantities, missing, out = stars.quantities, stars.missing, dict[str, Column]()
+        for key, distribution in self.distributions.items():
+            mean, sigma = distribution.at(stars.magnitude[missing])
+            if key in MOTIONS and self.sigma is not None:
+                sigma = np.full(len(sigma), self.sigma)
+            pairs = zip((key, f"sigma_{key}"), stars.factors[key], (mean, sigma), strict=True)
+            for name, factor, filling in pairs:
+                column = quantities[name]
+                values = column.numbers_or(0.0)
+                values[missing] = filling / factor
+                out[column.name] = Column(values, unit=column.unit)
+        for key in CORRELATIONS - {"corr_ra_dec"}:
+            if key in quantities:
+                rho = quantities[key].numbers_or(0.0)
+                rho[missing] = 0.0
+                out[quantities.found[key]] = Column(rho)
+        return out
+
+    def filled(self, quantities: Quantities) -> Quantities:
+        """Quantities of a block of rows in which stars without a motion have that of the prior."""
+        stars = MovingStars.of(quantities, self.unit)
+        if stars is None or not stars.missing.any():
+            return quantities
+        return replace(quantities, table=_Replaced(quantities.table, self.columns(stars)))
+
+    def note(self, n_missing: int, n: int) -> str:
+        """Clause about the stars that have a motion from the prior."""
+        size, unit = self.sigma, self.unit or ON_SKY
+        if size is None:
+            first, second = (self.distributions[key].sigma for key in MOTIONS[:2])
+            size = float(np.hypot(first, second)) / 2**0.5
+        if self.mas is not None:
+            size, unit = size * self.mas, "mas"
+        return (
+            f"{n_missing} of {n} rows have no motion; they were given that of the others of "
+            f"similar magnitude, with an error of {size:.3g} {unit}/yr on an axis"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Replaced:
+    """Table with other values in some columns."""
+
+    table: TableColumns
+    columns: Mapping[str, Column]
+
+    @property
+    def colnames(self) -> Sequence[str]:
+        """Names of the columns."""
+        return self.table.colnames
+
+    def __len__(self) -> int:
+        return len(self.table)
+
+    def __getitem__(self, name: str) -> Any:
+        return self.columns[name] if name in self.columns else self.table[name]
+
+
+@dataclass(frozen=True, eq=False)
+class Distribution:
+    """Normal distribution of a quantity, in bins of magnitude."""
+
+    mean: float  # of stars without a magnitude
+    sigma: float
+    magnitude: Float  # (B,), median of each bin
+    means: Float  # (B,)
+    sigmas: Float  # (B,)
+
+    @classmethod
+    def of(cls, values: Float, magnitude: Float) -> Distribution:
+        """Distribution of measured values (M,) with magnitudes (M,), NaN if unknown."""
+        none = np.zeros(0)
+        if not len(values):
+            return cls(0.0, 0.0, none, none, none)
+        known = np.flatnonzero(np.isfinite(magnitude))
+        n_bins = min(MOST_BINS, len(known) // PER_BIN)
+        if n_bins < 2:
+            return cls(*_normal(values), none, none, none)
+        order = known[np.argsort(magnitude[known], kind="stable")]
+        bins = np.array_split(order, n_bins)
+        centres = np.array([np.median(magnitude[rows]) for rows in bins])
+        means, sigmas = np.array([_normal(values[rows]) for rows in bins]).T
+        return cls(*_normal(values), centres, means, sigmas)
+
+    def at(self, magnitude: Float) -> tuple[Float, Float]:
+        """Means and standard deviations (n,) for stars of these magnitudes (n,)."""
+        n = len(magnitude)
+        mean, sigma = np.full(n, self.mean), np.full(n, self.sigma)
+        has = np.isfinite(magnitude)
+        if len(self.magnitude) and has.any():
+            nearest = np.argmin(np.abs(magnitude[has, None] - self.magnitude), axis=1)
+            mean[has], sigma[has] = self.means[nearest], self.sigmas[nearest]
+        return mean, sigma
+
+
+def warn_of_zeros(names: Sequence[str], n_zero: int, n: int, source: str) -> None:
+    """Log a warning about motions of exactly 0 in the columns `names`, if there are any."""
+    if n_zero:
         log.warning(
             "%s: WARNING: %d of %d stars have %s and %s of exactly 0: taken as missing values",
-            *(source, np.count_nonzero(zero), len(table), found["pm_ra"], found["pm_dec"]),
+            *(source, n_zero, n, *names),
         )
-    pairs = [("pm_ra", "sigma_pm_ra", "arcsec / yr"), ("pm_dec", "sigma_pm_dec", "arcsec / yr")]
-    if {"parallax", "sigma_parallax"} <= found.keys():
-        pairs.append(("parallax", "sigma_parallax", "arcsec"))
-    out, magnitude, sizes = table.copy(copy_data=False), _magnitudes(table, found), []
-    for key, sigma_key, unit in pairs:
-        columns = [quantities[name] for name in (key, sigma_key)]
-        if any(column.unit is None for column in columns):
-            continue
-        factors = [column.factor(unit) for column in columns]
-        values, errors = (f * c.numbers_or(0.0) for f, c in zip(factors, columns, strict=True))
-        measured = ~missing & ~absent(columns[0].values, not_finite=True)
-        mean, sigma = _prior(values, magnitude, measured, missing)
-        if key in MOTIONS:
-            if sigma_mas_yr is not None:
-                sigma = np.full(len(sigma), sigma_mas_yr * ARCSEC_PER_MAS)
-            sizes.append(sigma)
-        values[missing], errors[missing] = mean, sigma
-        for column, factor, filled in zip(columns, factors, (values, errors), strict=True):
-            out[column.name] = Column(filled / factor, unit=column.unit)
-    for key in CORRELATIONS - {"corr_ra_dec"}:
-        if key in found:
-            rho = quantities[key].numbers_or(0.0)
-            rho[missing] = 0.0
-            out[found[key]] = Column(rho)
-    size = np.median(np.hypot(*sizes)) / np.sqrt(2.0) / ARCSEC_PER_MAS
-    note = (
-        f"{np.count_nonzero(missing)} of {len(table)} rows have no motion; they were given that of "
-        f"the others of similar magnitude, with an error of {size:.3g} mas/yr on an axis (median)"
-    )
-    return out, (*notes, note)
 
 
-def _named(table: Table, wanted: str) -> str | None:
+def _plain(column: Any) -> Any:
+    """Values of a column that is encoded, or the column itself."""
+    return column.plain if isinstance(column, EncodedColumn) else column
+
+
+def unnamed_columns(names: Iterable[str]) -> list[str]:
+    """Columns of Gaia's tables that are used beside those of quantities, as far as they exist."""
+    return [name for name in names if name.lower() in (SOLVED, G_MAGNITUDE, RUWE)]
+
+
+def _named(table: TableColumns, wanted: str) -> str | None:
     """Name of a column in any case; None if the table has no such column."""
     return next((name for name in table.colnames if name.lower() == wanted), None)
 
 
-def _without_solution(table: Table) -> Bool:
+def _without_solution(table: TableColumns) -> Bool:
     """Mask (N,) of stars for which Gaia has solved the position alone."""
-    name = _named(table, "astrometric_params_solved")
+    name = _named(table, SOLVED)
     if name is None:
         return np.zeros(len(table), bool)
-    return np.asarray(np.ma.filled(np.ma.asarray(table[name]), 0) == TWO_PARAMETERS)
+    return np.asarray(np.ma.filled(np.ma.asarray(_plain(table[name])), 0) == TWO_PARAMETERS)
 
 
-def _refuse_missing_errors(quantities: Quantities, measured: Bool) -> None:
-    """Raise InputError for a measured motion without an error."""
-    for key in MOTIONS[2:]:
-        column = quantities[key]
-        bad = measured & absent(column.values, not_finite=True)
-        if bad.any():
-            raise column.fail(int(np.argmax(bad)), "a measured proper motion has no error")
-
-
-def _doubtful(table: Table) -> tuple[str, ...]:
-    """Note on stars whose solution Gaia's documentation doubts; empty if there are none."""
-    name = _named(table, "ruwe")
+def _n_doubtful(table: TableColumns) -> int:
+    """Number of stars whose solution Gaia's documentation doubts."""
+    name = _named(table, RUWE)
     if name is None:
-        return ()
-    values = np.ma.filled(np.ma.asarray(table[name]), 0.0)
-    n = np.count_nonzero(values > DOUBTFUL_RUWE) if values.dtype.kind in "iuf" else 0
-    if not n:
+        return 0
+    values = np.ma.filled(np.ma.asarray(_plain(table[name])), 0.0)
+    return int(np.count_nonzero(values > DOUBTFUL_RUWE)) if values.dtype.kind in "iuf" else 0
+
+
+def doubtful_solutions(n_doubtful: int, n: int) -> tuple[str, ...]:
+    """Note on stars with a doubtful solution; empty if there are none."""
+    if not n_doubtful:
         return ()
     return (
-        f"{n} of {len(table)} rows have a ruwe above {DOUBTFUL_RUWE}: they may be double stars, "
+        f"{n_doubtful} of {n} rows have a ruwe above {DOUBTFUL_RUWE}: they may be double stars, "
         "whose motions Gaia's documentation doubts",
     )
 
 
-def _magnitudes(table: Table, found: Mapping[str, str]) -> Float:
+def _magnitudes(table: TableColumns, found: Mapping[str, str]) -> Float:
     """Magnitudes (N,) of the catalogue if it is Gaia, else of the table; NaN if unknown."""
-    name = _named(table, "phot_g_mean_mag") or found.get("mag")
+    name = _named(table, G_MAGNITUDE) or found.get("mag")
     out = np.full(len(table), np.nan)
     if name is None:
         return out
-    column: Any = table[name]
+    column: Any = _plain(table[name])
     plain = getattr(column, "unmasked", column)
     values = np.asarray(getattr(plain, "value", plain))
     if values.dtype.kind in "iuf":
         known = ~absent(column, not_finite=True)
         out[known] = values[known]
     return out
-
-
-def _prior(values: Float, magnitude: Float, measured: Bool, at: Bool) -> tuple[Float, Float]:
-    """Means and standard deviations (n,) of the prior for the n stars `at`.
-
-    They are those of the bin of measured stars that is next in magnitude.  Zero without measured
-    stars.
-    """
-    n = int(at.sum())
-    if not measured.any():
-        return np.zeros(n), np.zeros(n)
-    known = measured & np.isfinite(magnitude)
-    n_bins = min(MOST_BINS, int(known.sum()) // PER_BIN)
-    mean, sigma = (np.full(n, number) for number in _normal(values[measured]))
-    if n_bins < 2:
-        return mean, sigma
-    order = np.flatnonzero(known)[np.argsort(magnitude[known], kind="stable")]
-    bins = np.array_split(order, n_bins)
-    centres = np.array([np.median(magnitude[rows]) for rows in bins])
-    numbers = np.array([_normal(values[rows]) for rows in bins])
-    wanted = magnitude[at]
-    nearest = np.argmin(np.abs(np.nan_to_num(wanted)[:, None] - centres), axis=1)
-    has = np.isfinite(wanted)
-    mean[has], sigma[has] = numbers[nearest[has]].T
-    return mean, sigma
 
 
 def _normal(values: Float) -> tuple[float, float]:

@@ -80,8 +80,9 @@ class ReadOptions:
         arcsec.
     motion_prior : float, optional
         Standard deviation on each axis, in mas per year, of the motions of stars without a measured
-        one. The default is the scatter of the other stars, if there are at least 30; with fewer,
-        and in tables without errors of positions and motions, such stars are left out.
+        one; only with sigma = 'columns'. The default is the scatter of the other stars, if there
+        are at least 30; with fewer, in tables without errors of positions and motions, and with any
+        other `sigma`, such stars are left out.
 
     Raises
     ------
@@ -118,6 +119,14 @@ class ReadOptions:
                 f"motion_prior is {self.motion_prior}",
                 where="data.motion_prior",
                 do="give a positive number of mas per year",
+            )
+        if self.motion_prior is not None and not self.read_sigma:
+            raise InputError(
+                f"motion_prior is given, and sigma is {self.sigma!r}, which does not grow with the "
+                "error of a motion",
+                where="data.motion_prior",
+                do="leave it out: stars without a motion are then left out; or set sigma to "
+                "'columns'",
             )
         if self.tangent_point is not None:
             point = direction_in(self.tangent_point, "tangent_point", where="data.tangent_point")

@@ -266,14 +266,14 @@ def match_arguments(
         "pm_ra" in column_names and dated and ("epoch" in column_names or options.epoch is not None)
     )
     if moves:
-        table, of_motions = with_prior_motions(
+        filled = with_prior_motions(
             table,
             column_names,
             source=source,
             sigma_mas_yr=options.motion_prior,
             reject=options.not_finite == "reject",
         )
-        notes = (*notes, *of_motions)
+        table, notes = filled.table, (*notes, *filled.notes)
     rows_with_values = partial(
         without_missing,
         table,

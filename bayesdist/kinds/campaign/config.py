@@ -31,6 +31,7 @@ class CampaignBlock(StarListsBlock):
     catalog_columns: dict[str, str] | None = None
     unit: Unit | None = None
     catalogue_epoch: Epoch | None = None
+    motion_prior: PositiveFloat | None = None  # mas per year
     parity: Literal["auto", "direct", "mirrored"] = "auto"
     filter: str | None = None
     radius: PositiveFloat | None = None

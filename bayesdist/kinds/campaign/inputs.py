@@ -165,6 +165,7 @@ def read_campaign_catalog(
             unit=block.unit,
             epoch=block.catalogue_epoch,
             tangent_point=point,
+            motion_prior=block.motion_prior,
         )
 
     try:

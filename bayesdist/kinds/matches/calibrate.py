@@ -272,7 +272,8 @@ def _stars(matches: Any, sigma: Any, options: Mapping[str, Any]) -> tuple[Matche
                 where=WHERE,
                 do=f"give one of {', '.join(READING)}",
             )
-        matches = Matches(**match_arguments(matches, ReadOptions(**options)))
+        reading = ReadOptions(**options) if sigma is None else ReadOptions(**options, sigma=sigma)
+        matches = Matches(**match_arguments(matches, reading))
     elif options.keys() - {"same_position"}:
         raise ConfigError(
             f"data.{min(options.keys() - {'same_position'})} is an option of reading, and the "
