@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import weakref
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,7 +23,7 @@ from bayesdist.assess.terms.correlated import (
     LocalErrors,
     StructureErrors,
 )
-from bayesdist.assess.terms.forms import DrawnField, Functions, Known, Row
+from bayesdist.assess.terms.forms import DrawnField, Functions, Image, Known, Row
 from bayesdist.assess.terms.given import Centroids
 from bayesdist.assess.terms.parameters import (
     CatalogueErrors,
@@ -308,6 +309,17 @@ class Ripple:
     def draw(self, n, rng):
         size = self.sigma * rng.standard_normal((n, 2, 1))
         return Functions(self.rows[0], {None: size}, waves, n)
+
+
+def test_errors_at_positions_are_freed_with_their_draws():
+    """Not when Python next looks for reference cycles: they are the largest arrays of a run."""
+    draws = Ripple(0.03).draw(DRAWS, np.random.default_rng(2))
+    domain = EvaluationDomain.of_chips(MODEL, (9, 3), epoch=EPOCH)
+    errors = draws.on(domain, Image())
+    assert draws.on(domain, Image()) is errors
+    freed = weakref.ref(errors)
+    del errors, draws
+    assert freed() is None
 
 
 def test_a_term_that_is_new_is_in_every_result():

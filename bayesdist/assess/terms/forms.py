@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, reduce
 from typing import ClassVar, Protocol, runtime_checkable
 
@@ -425,7 +425,8 @@ class Functions:
         key = domain.at(None)
         if key not in self._cache:
             self._cache.clear()
-            self._cache[key] = FunctionField((self.row,), key, self)
+            # without this cache, since a reference cycle would keep large arrays in memory
+            self._cache[key] = FunctionField((self.row,), key, replace(self, _cache={}))
         return self._cache[key]
 
     def of(self, chip: int) -> NDArray[np.floating] | None:
