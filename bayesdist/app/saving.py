@@ -19,7 +19,7 @@ from bayesdist.app.run import Run
 from bayesdist.app.store.keys import attributes
 from bayesdist.app.store.output import write_table
 from bayesdist.app.store.rundir import part_files
-from bayesdist.app.store.summary import GeometryRow, Sampler
+from bayesdist.app.store.summary import GeometryRow, SamplerSection
 from bayesdist.app.tables.result_files import write_diagnostics, write_evaluation
 from bayesdist.data import Matches
 from bayesdist.data.storage import write_columns
@@ -218,7 +218,7 @@ def sample_sections(posterior: Posterior, *, in_circle: bool) -> dict[str, Any]:
     """
     return {
         "outliers": _outliers(posterior, in_circle),
-        "sampler": Sampler.row(posterior.sampler, posterior.convergence),
+        "sampler": SamplerSection.row(posterior.sampler, posterior.convergence),
     }
 
 

@@ -19,7 +19,7 @@ from bayesdist.products.common.document import Finding
 from bayesdist.products.common.rules import missing_entries
 
 
-class Settings(PlacedSettings):
+class JwstSettings(PlacedSettings):
     """Configuration of a JWST distortion reference file."""
 
     instrument: Literal["NIRCAM", "NIRISS", "FGS", "MIRI"]
@@ -74,7 +74,7 @@ def module_and_channel(detector: str) -> tuple[str, str]:
     return detector[3], "LONG" if detector in _LONG else "SHORT"
 
 
-def _instrument(detector: str, settings: Settings) -> InstrumentMeta:
+def _instrument(detector: str, settings: JwstSettings) -> InstrumentMeta:
     """Node meta.instrument; InputError for a detector that the instrument does not have."""
     instrument = settings.instrument
     detectors = _DETECTORS[instrument]
@@ -102,7 +102,7 @@ _REQUIRED = ("reftype", "description", "author", "pedigree", "useafter", "telesc
 _NIRCAM = ("module", "channel", "p_pupil")
 
 
-def _meta(detector: str, settings: Settings) -> ReferenceMeta:
+def _meta(detector: str, settings: JwstSettings) -> ReferenceMeta:
     """Node meta of the file of one detector."""
     return {
         "telescope": "JWST",
@@ -142,7 +142,7 @@ def lint_meta(meta: Mapping[str, Any]) -> Iterator[Finding]:
                 )
 
 
-FORMAT = Observatory[Settings](
+FORMAT = Observatory[JwstSettings](
     "jwst",
     "JWST",
     _node,
@@ -150,4 +150,4 @@ FORMAT = Observatory[Settings](
     lint_meta,
     _meta,
     lambda meta, model, record, _: {"meta": meta, "model": model, "bayesdist": record},
-).format("a JWST distortion reference file", 7, Settings)
+).format("a JWST distortion reference file", 7, JwstSettings)

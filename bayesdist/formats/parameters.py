@@ -21,7 +21,7 @@ from bayesdist.products.common.parameters import (
 KIND = "table of parameters"
 
 
-class Settings(FormatSettings):
+class ParametersSettings(FormatSettings):
     """Configuration of a table of parameters, which has no options."""
 
 
@@ -50,7 +50,9 @@ def _describe(table: tuple[str, Hdu]) -> list[str]:
     ]
 
 
-def build(calibration: Calibration, _: Settings, options: BuildOptions) -> tuple[Built, ...]:
+def build(
+    calibration: Calibration, _: ParametersSettings, options: BuildOptions
+) -> tuple[Built, ...]:
     """Build one FITS file with all chips at one date; InputError for look-up tables."""
     if calibration.before or calibration.after:
         raise InputError(
@@ -69,6 +71,6 @@ FORMAT = Format(
     _parse,
     _describe,
     calibration=lambda table, name, _: stored_calibration(table[1], name),
-    settings=Settings,
+    settings=ParametersSettings,
     build=build,
 )

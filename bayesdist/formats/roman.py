@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 KEY = "coordinate_distortion_transform"
 
 
-class Settings(PlacedSettings):
+class RomanSettings(PlacedSettings):
     """Configuration of a Roman WFI distortion reference file."""
 
     optical_element: str
@@ -57,7 +57,7 @@ _WFI = Detector((4088.0, 4088.0), 0.1075)
 _REQUIRED = ("reftype", "description", "author", "pedigree", "useafter", "telescope", "origin")
 
 
-def _meta(detector: str, settings: Settings) -> ReferenceMeta:
+def _meta(detector: str, settings: RomanSettings) -> ReferenceMeta:
     """Node meta of the file of one detector; InputError for values outside the schema."""
     for key, value, allowed in (
         ("detector", detector, DETECTORS),
@@ -107,7 +107,7 @@ def lint_meta(meta: Mapping[str, Any]) -> Iterator[Finding]:
     yield from other_type(str(meta.get("reftype", "")), "DISTORTION", "meta.reftype")
 
 
-FORMAT = Observatory[Settings](
+FORMAT = Observatory[RomanSettings](
     "roman",
     "Roman",
     _node,
@@ -118,4 +118,4 @@ FORMAT = Observatory[Settings](
         "roman": tagged({"meta": meta, KEY: model, "bayesdist": record}, TAG, file)
     },
     units=("pixel", "arcsec"),  # as defined by the schema
-).format("a Roman distortion reference file", 6, Settings)
+).format("a Roman distortion reference file", 6, RomanSettings)

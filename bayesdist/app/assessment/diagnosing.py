@@ -13,7 +13,7 @@ from bayesdist.app.artefacts.stars import in_circle
 from bayesdist.app.assessment.error_terms import assessment_rng
 from bayesdist.app.assessment.periods import period_settings
 from bayesdist.app.run import Run
-from bayesdist.app.store.summary import CoverageRow, Holdout, HoldoutTest
+from bayesdist.app.store.summary import CoverageRow, HoldoutSection, HoldoutTest
 from bayesdist.assess.domain import WHOLE, in_region
 from bayesdist.data import Matches, ReferenceCatalog
 from bayesdist.diagnose.diagnostics import Diagnostics, diagnose_fit, diagnose_posterior
@@ -114,7 +114,7 @@ def holdout_table(found: HoldoutValidation) -> Table:
 
 def holdout_summary(found: HoldoutValidation) -> dict[str, Any]:
     """Section 'holdout' of summary.json."""
-    return Holdout.row(
+    return HoldoutSection.row(
         found,
         n_excluded=found.n_left_out,
         coverage=[CoverageRow.row(row, sigma=row.level) for row in found.coverage],

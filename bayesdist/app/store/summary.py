@@ -13,7 +13,7 @@ from bayesdist.app.config import installed_kinds
 Number = float | None  # null where it is not finite, or not known
 
 
-class Part(BaseModel):
+class SummaryPart(BaseModel):
     """Part of summary.json; later versions of the package may add keys to it."""
 
     model_config = ConfigDict(extra="allow", frozen=True)
@@ -30,14 +30,14 @@ class Part(BaseModel):
         return getattr(next(source for source in objects if hasattr(source, name)), name)
 
 
-class MeanAndSd(Part):
+class MeanAndSd(SummaryPart):
     """Posterior mean and standard deviation."""
 
     mean: Number
     sd: Number
 
 
-class AddedErrorRow(Part):
+class AddedErrorRow(SummaryPart):
     """Error of a group of matches along an axis, in addition to the quoted one."""
 
     label: str
@@ -50,7 +50,7 @@ class AddedErrorRow(Part):
     variance_error: Number
 
 
-class MapRow(Part):
+class MapRow(SummaryPart):
     """Largest position errors over a chip."""
 
     chip: int
@@ -65,7 +65,7 @@ class MapRow(Part):
     radius_max_relative: Number = Field(None, description="of relative positions, with a gauge")
 
 
-class MisfitRow(Part):
+class MisfitRow(SummaryPart):
     """Structure that the least-squares fit leaves in the residuals."""
 
     chip: int | None = None
@@ -77,7 +77,7 @@ class MisfitRow(Part):
     )
 
 
-class StructureRow(Part):
+class StructureRow(SummaryPart):
     """Structure beyond the model on one axis of a chip."""
 
     chip: int
@@ -88,7 +88,7 @@ class StructureRow(Part):
     length_pix: Number = Field(description="correlation length, pixels")
 
 
-class ScoreTestRow(Part):
+class ScoreTestRow(SummaryPart):
     """Targeted test of the residuals for an effect that the model lacks."""
 
     name: str
@@ -104,7 +104,7 @@ class ScoreTestRow(Part):
     significant: bool
 
 
-class CoverageRow(Part):
+class CoverageRow(SummaryPart):
     """Fraction of the stars within a number of sigma of the prediction."""
 
     axis: str
@@ -115,7 +115,7 @@ class CoverageRow(Part):
     interval: list[Number] = Field(description="95 %")
 
 
-class HoldoutTest(Part):
+class HoldoutTest(SummaryPart):
     """Test of the held-out stars."""
 
     name: str
@@ -129,7 +129,7 @@ class HoldoutTest(Part):
     p_corrected: Number = Field(description="Holm")
 
 
-class BudgetRow(Part):
+class BudgetRow(SummaryPart):
     """Row of the error budget: rms over all chips."""
 
     name: str
@@ -141,7 +141,7 @@ class BudgetRow(Part):
     source: str = ""
 
 
-class WorstPosition(Part):
+class WorstPositionRow(SummaryPart):
     """Position with the largest error for a requirement."""
 
     chip: int
@@ -150,7 +150,7 @@ class WorstPosition(Part):
     rms: Number
 
 
-class MarginRow(Part):
+class MarginRow(SummaryPart):
     """Margin of a requirement."""
 
     name: str
@@ -175,11 +175,11 @@ class MarginRow(Part):
     verdict: str = Field(description="met, missed, not shown or undecided")
     reason: str
     rests_on: list[str]
-    worst: WorstPosition
+    worst: WorstPositionRow
     remedy: str | None
 
 
-class ValidityRow(Part):
+class ValidityRow(SummaryPart):
     """Date until which a requirement is met."""
 
     name: str
@@ -190,7 +190,7 @@ class ValidityRow(Part):
     sentence: str
 
 
-class ProductRow(Part):
+class ProductRow(SummaryPart):
     """File for a pipeline, and the results of checks of the file as written."""
 
     path: str
@@ -201,7 +201,7 @@ class ProductRow(Part):
     total_rms: Number = Field(None, description="total error for those who use the file forward")
 
 
-class Data(Part):
+class DataSection(SummaryPart):
     """Numbers of rows that were read and used, and their sources."""
 
     n_rows: int
@@ -215,7 +215,7 @@ class Data(Part):
     )
 
 
-class AddedErrors(Part):
+class AddedErrorsSection(SummaryPart):
     """Errors of groups of matches, in addition to the quoted ones."""
 
     grouping: str
@@ -232,7 +232,7 @@ class AddedErrors(Part):
         return rows
 
 
-class GeometryRow(Part):
+class GeometryRow(SummaryPart):
     """Linear part of the map of a chip in the least-squares fit, and its largest distortion."""
 
     chip: int
@@ -246,7 +246,7 @@ class GeometryRow(Part):
     sentence: str
 
 
-class Fit(Part):
+class FitSection(SummaryPart):
     """Least-squares fit."""
 
     order: int
@@ -258,11 +258,11 @@ class Fit(Part):
     condition: Number
     n_parameters: int
     error_scale: Number = Field(1.0, description="factor on the quoted errors")
-    added_errors: AddedErrors | None = None
+    added_errors: AddedErrorsSection | None = None
     geometry: list[GeometryRow] = Field([], description="of each chip")
 
 
-class Outliers(Part):
+class OutliersSection(SummaryPart):
     """Outlier mixture."""
 
     model: Literal["gaussian", "uniform", "none"]
@@ -274,7 +274,7 @@ class Outliers(Part):
     match_circle: Number = None
 
 
-class Sampler(Part):
+class SamplerSection(SummaryPart):
     """Sampling of the posterior, and convergence of the chains."""
 
     method: str
@@ -293,7 +293,7 @@ class Sampler(Part):
     wall_s: Number
 
 
-class Map(MapRow):
+class MapSection(MapRow):
     """Largest position errors: of all chips, and of each chip."""
 
     unit: str
@@ -301,7 +301,7 @@ class Map(MapRow):
     chips: list[MapRow]
 
 
-class Misfit(MisfitRow):
+class MisfitSection(MisfitRow):
     """Structure in the residuals: of the worst chip, corrected for their number, and of each."""
 
     unit: str
@@ -309,7 +309,7 @@ class Misfit(MisfitRow):
     chips: list[MisfitRow] = Field(default_factory=list)
 
 
-class CorrelatedErrors(Part):
+class CorrelatedErrorsSection(SummaryPart):
     """Distortion that the model may leave out, estimated from the residuals of all stars."""
 
     structure: list[StructureRow]
@@ -317,7 +317,7 @@ class CorrelatedErrors(Part):
     noise_ratio: Number = Field(description="variance by the stars' scatter over the formal one")
 
 
-class Holdout(Part):
+class HoldoutSection(SummaryPart):
     """Quality of the prediction for held-out stars."""
 
     n: int
@@ -330,7 +330,7 @@ class Holdout(Part):
     tests: list[HoldoutTest]
 
 
-class Periods(Part):
+class PeriodsSection(SummaryPart):
     """Change of the distortion with time."""
 
     verdict: str
@@ -340,41 +340,41 @@ class Periods(Part):
     first_vs_last: dict[str, Any]
 
 
-class Warned(Part):
+class Warned(SummaryPart):
     """Section with warnings."""
 
     warnings: list[str] = Field(default_factory=list)
 
 
-class Verdict(Part):
+class VerdictSection(SummaryPart):
     """Worst of all checks, requirements and validity periods, in words."""
 
     level: Literal["pass", "warn", "fail"]
     headline: str
 
 
-class Sections(Part):
+class Sections(SummaryPart):
     """Results of the completed stages, by section."""
 
     matching: Warned | None = Field(None, description="of a campaign")
     selfcal: Warned | None = Field(None, description="of a self-calibration")
-    data: Data | None = None
-    fit: Fit | None = None
-    outliers: Outliers | None = None
-    sampler: Sampler | None = None
-    discrepancy: CorrelatedErrors | None = None
+    data: DataSection | None = None
+    fit: FitSection | None = None
+    outliers: OutliersSection | None = None
+    sampler: SamplerSection | None = None
+    discrepancy: CorrelatedErrorsSection | None = None
     score_tests: list[ScoreTestRow] | None = None
-    holdout: Holdout | None = None
-    periods: Periods | None = None
-    map: Map | None = None
+    holdout: HoldoutSection | None = None
+    periods: PeriodsSection | None = None
+    map: MapSection | None = None
     budget: list[BudgetRow] | None = None
-    misfit: Misfit | None = None
+    misfit: MisfitSection | None = None
     margins: list[MarginRow] | None = None
     validity_periods: list[ValidityRow] | None = None
     warnings: list[str] | None = None
     products: list[ProductRow] | None = None
     figures: list[str] | None = None
-    verdict: Verdict | None = Field(None, description="headline of the report")
+    verdict: VerdictSection | None = Field(None, description="headline of the report")
     gauge: dict[str, Any] | None = Field(None, description="exposures: what holds the solution")
     lines: list[dict[str, Any]] | None = Field(None, description="linear terms against time")
     tables: Warned | None = Field(None, description="look-up tables")

@@ -10,7 +10,7 @@ from astropy.table import Table
 
 from bayesdist.app.screen import number, table_text
 from bayesdist.app.store.rundir import RunDirectory
-from bayesdist.app.store.summary import MarginRow, WorstPosition
+from bayesdist.app.store.summary import MarginRow, WorstPositionRow
 from bayesdist.assess import Margin, Requirement
 from bayesdist.assess.maps import per_axis
 from bayesdist.utils.numbers import probability_words
@@ -26,7 +26,7 @@ def margin_rows(margins: Sequence[Margin]) -> list[dict[str, Any]]:
             m,
             m.requirement,
             margin_percent=m.percent,
-            worst=WorstPosition.row(m.worst),
+            worst=WorstPositionRow.row(m.worst),
             remedy=None if m.remedy is None else m.remedy.sentence,
         )
         for m in margins

@@ -36,14 +36,16 @@ from bayesdist.utils.arrays import Float
 from bayesdist.utils.text import ascii_of, number_of
 
 
-class Settings(FormatSettings):
+class AstSettings(FormatSettings):
     """Configuration of an AST mapping and its iterative inverse."""
 
     n_iter: PositiveInt = 20
     tolerance: PositiveFloat = 1e-12
 
 
-def build(calibration: Calibration, settings: Settings, options: BuildOptions) -> tuple[Built, ...]:
+def build(
+    calibration: Calibration, settings: AstSettings, options: BuildOptions
+) -> tuple[Built, ...]:
     """Build for each chip the mapping and the file with its covariance."""
     if calibration.before or calibration.after:
         raise InputError(
@@ -66,7 +68,7 @@ def build(calibration: Calibration, settings: Settings, options: BuildOptions) -
 
 
 def _text(
-    calibration: Calibration, settings: Settings, scale_arcsec: float | None, side: str
+    calibration: Calibration, settings: AstSettings, scale_arcsec: float | None, side: str
 ) -> str:
     """Dump of a chain: scaling of 0-based pixels to -1 .. 1 over the detector, and a polynomial."""
     [(number, chip_map)] = calibration.at(origin="stated").items()
@@ -131,7 +133,7 @@ def _moved(terms: tuple[tuple[int, int], ...], zero: Float) -> Float:
     return out
 
 
-def _poly_lines(rows: list[tuple[float, int, int, int]], settings: Settings) -> list[str]:
+def _poly_lines(rows: list[tuple[float, int, int, int]], settings: AstSettings) -> list[str]:
     highest = [max(row[2 + a] for row in rows) for a in (0, 1)]
     half = len(rows) // 2
     lines = ["   Nin = 2", "IsA Mapping"]
@@ -321,6 +323,6 @@ def ast_calibration(file: AstFile, name: str, choice: Choice) -> Calibration:
 
 
 FORMAT = Format(
-    "ast", "an AST mapping", 34, ast_of, _describe, lint_ast, ast_calibration, Settings, build,
+    "ast", "an AST mapping", 34, ast_of, _describe, lint_ast, ast_calibration, AstSettings, build,
     needs_scale=lambda settings: True, asks=("size",),
 )  # fmt: skip

@@ -65,7 +65,7 @@ _MOST = 1025  # largest number of nodes per axis
 _CHECK = 397  # points per axis at which the tables are compared with the map
 
 
-class Settings(FormatSettings):
+class CpdisSettings(FormatSettings):
     """Configuration of a file with CPDIS look-up tables."""
 
     # pixels between nodes; by default, fine enough for an error of 1e-4 pixels
@@ -73,7 +73,9 @@ class Settings(FormatSettings):
     crval: tuple[float, float] | None = None
 
 
-def build(calibration: Calibration, settings: Settings, options: BuildOptions) -> tuple[Built, ...]:
+def build(
+    calibration: Calibration, settings: CpdisSettings, options: BuildOptions
+) -> tuple[Built, ...]:
     """Build the file; its summary gives the largest rounding and interpolation error in pixels."""
     scale = options.scale_arcsec
     calibration = placed_at(calibration, settings.crval, scale, where="products.cpdis")
@@ -367,6 +369,6 @@ def _alternates(image: CpdisImage) -> Iterator[Finding]:
 
 FORMAT = Format(
     "cpdis", "an image with CPDIS look-up tables", 33, cpdis_of, _describe, lint_cpdis,
-    cpdis_calibration, Settings, build, holds_tables=True, needs_scale=lambda settings: True,
+    cpdis_calibration, CpdisSettings, build, holds_tables=True, needs_scale=lambda settings: True,
     asks=("size",),
 )  # fmt: skip

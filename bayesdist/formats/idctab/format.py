@@ -116,7 +116,7 @@ def _non_linear(tab: IdcTab, row: int) -> str:
     return " and ".join(out)
 
 
-class Settings(FormatSettings):
+class IdctabSettings(FormatSettings):
     """Configuration of an IDCTAB reference file."""
 
     instrument: str
@@ -140,7 +140,7 @@ def _parse(content: Content) -> IdcTab | None:
 
 
 def _build(
-    calibration: Calibration, settings: Settings, options: BuildOptions
+    calibration: Calibration, settings: IdctabSettings, options: BuildOptions
 ) -> tuple[Built, ...]:
     tab = idctab_from_solution(
         calibration,
@@ -160,7 +160,7 @@ FORMAT = Format(
     describe_idctab,
     lint_idctab,
     lambda tab, _, choice: idctab_calibration(tab, choice.filter),
-    Settings,
+    IdctabSettings,
     _build,
     highest_order=HIGHEST,
     holds_time=True,

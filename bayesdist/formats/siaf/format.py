@@ -58,14 +58,16 @@ from bayesdist.utils.text import ascii_of
 WHERE = "products.siaf"
 
 
-class Settings(FormatSettings):
+class SiafSettings(FormatSettings):
     """Configuration of a SIAF coefficient table."""
 
     aperture: str | None = None  # default: the names of the chips, or of the detector
     order: Annotated[int, Field(ge=1, le=HIGHEST)] | None = None
 
 
-def build(calibration: Calibration, settings: Settings, options: BuildOptions) -> tuple[Built, ...]:
+def build(
+    calibration: Calibration, settings: SiafSettings, options: BuildOptions
+) -> tuple[Built, ...]:
     """Build a covariance file and a table for each chip, in this order.
 
     The covariance file comes first so that it exists when a program reads the table.
@@ -376,7 +378,7 @@ FORMAT = Format(
     describe_siaf,
     lint_siaf,
     siaf_calibration,
-    Settings,
+    SiafSettings,
     build,
     _read_back,
     highest_order=HIGHEST,

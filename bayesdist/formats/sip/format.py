@@ -46,7 +46,7 @@ from bayesdist.products.common.parameters import with_parameters
 from bayesdist.products.common.wcs_text import describe_wcs
 
 
-class Settings(FormatSettings):
+class SipSettings(FormatSettings):
     """Configuration of a SIP header."""
 
     inverse_order: Annotated[int, Field(ge=2, le=9)] | None = None
@@ -83,7 +83,7 @@ def _calibration(content: Content, name: str, choice: Choice) -> Calibration:
 
 
 def _build(
-    calibration: Calibration, settings: Settings, options: BuildOptions
+    calibration: Calibration, settings: SipSettings, options: BuildOptions
 ) -> tuple[Built, ...]:
     """Build one header per chip."""
     out = []
@@ -136,7 +136,7 @@ def _notes(sip: SipHeader, calibration: Calibration) -> tuple[str, ...]:
 
 
 def _projection_matters(
-    calibration: Calibration, settings: Settings, options: BuildOptions
+    calibration: Calibration, settings: SipSettings, options: BuildOptions
 ) -> tuple[str, ...]:
     """Warning that angular u, v may be in a projection other than TAN; empty if this is negligible.
 
@@ -279,7 +279,7 @@ FORMAT = Format(
     describe_sip,
     _lint,
     _calibration,
-    Settings,
+    SipSettings,
     _build,
     sip_read_back,
     highest_order=SIP_ORDERS[1],

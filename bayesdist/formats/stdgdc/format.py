@@ -49,13 +49,15 @@ _BETWEEN = 997  # largest number of points per axis, between pixels, at which th
 _LARGEST = 2**26  # pixels; a larger detector is a misprint
 
 
-class Settings(FormatSettings):
+class StdgdcSettings(FormatSettings):
     """Configuration of an STDGDC file."""
 
     precision: Literal["single", "double"] = "single"
 
 
-def build(calibration: Calibration, settings: Settings, options: BuildOptions) -> tuple[Built, ...]:
+def build(
+    calibration: Calibration, settings: StdgdcSettings, options: BuildOptions
+) -> tuple[Built, ...]:
     """Build the file; its summary gives the largest rounding and interpolation error in pixels."""
     if len(calibration.numbers) > 1:
         raise InputError(
@@ -306,5 +308,5 @@ def _stored(file: StdGdc) -> Iterator[Finding]:
 
 FORMAT = Format(
     "stdgdc", "an STDGDC file", 32, stdgdc_of, _describe, lint_stdgdc, stdgdc_calibration,
-    Settings, build, holds_tables=True,
+    StdgdcSettings, build, holds_tables=True,
 )  # fmt: skip

@@ -61,13 +61,15 @@ NAME = "tpv.head"
 _GRID = 33  # points per axis over which CRDER is the rms error
 
 
-class Settings(FormatSettings):
+class TpvSettings(FormatSettings):
     """Configuration of TPV headers."""
 
     crval: tuple[float, float] | None = None
 
 
-def build(calibration: Calibration, settings: Settings, options: BuildOptions) -> tuple[Built, ...]:
+def build(
+    calibration: Calibration, settings: TpvSettings, options: BuildOptions
+) -> tuple[Built, ...]:
     """Build one text file with the headers of all chips, and the file with their covariance.
 
     CD is the linear part at the reference pixel, and PV hold all other terms including the
@@ -286,6 +288,6 @@ def _mosaic(file: TpvFile) -> Iterator[Finding]:
 
 
 FORMAT = Format(
-    "tpv", "TPV headers", 31, tpv_of, _describe, lint_tpv, tpv_calibration, Settings, build,
+    "tpv", "TPV headers", 31, tpv_of, _describe, lint_tpv, tpv_calibration, TpvSettings, build,
     highest_order=HIGHEST, needs_scale=lambda settings: True, asks=("size",),
 )  # fmt: skip

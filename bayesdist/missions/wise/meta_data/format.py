@@ -58,7 +58,7 @@ from bayesdist.products.common.read_back import ReadBack
 Bands = tuple[WiseBand, ...]
 
 
-class Settings(FormatSettings):
+class MetaDataSettings(FormatSettings):
     """Configuration of the entries of the band that the detector is named after."""
 
     def check(
@@ -130,7 +130,9 @@ def _read_back(
     return out
 
 
-def _build(calibration: Calibration, _: Settings, options: BuildOptions) -> tuple[Built, ...]:
+def _build(
+    calibration: Calibration, _: MetaDataSettings, options: BuildOptions
+) -> tuple[Built, ...]:
     """Build entries in WISE's form: linear terms in A and B, and an inverse of the same order."""
     band = _band(calibration.detector)
     if band is None:
@@ -271,7 +273,7 @@ FORMAT = Format(
     _describe,
     _lint,
     lambda named, name, choice: wise_calibration(named[1], name, choice.filter),
-    Settings,
+    MetaDataSettings,
     _build,
     _read_back,
     highest_order=SIP_ORDERS[1],
