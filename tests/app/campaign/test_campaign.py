@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import pickle
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +14,8 @@ from astropy.table import Table
 
 import bayesdist as bd
 from bayesdist.app.artefacts.parts import read_tables
+from bayesdist.app.run import Run
+from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data import read_exposures, read_matches
 from bayesdist.formats.idctab.table import read_idctab
 from bayesdist.formats.lookup.d2im import read_d2im
@@ -19,6 +24,9 @@ from bayesdist.infer.nodes import NodeGrid
 from bayesdist.infer.solution.transforms import reference_gauge, segment, without_frames
 from bayesdist.missions.hst.simulate import read_acs
 from bayesdist.model import corrected
+from bayesdist.report.drawing import MIN_FIGURES_SHARED
+from bayesdist.report.run import to_be_drawn
+from bayesdist.report.sections import REPORT
 from tests.app.support import cli, good, one_sentence, snapshot, summary_of
 
 # ACS ISR 2015-06, Tables 1 to 3: chip, segment (RDATE 2004.5, 2012.5), alpha, beta
@@ -286,3 +294,19 @@ def test_the_calibration_of_a_run_has_its_tables(run, tmp_path):
         with fits.open(path) as file:
             limit = max(float(hdu.header.get("BDWORST", 0.0)) for hdu in file)
         assert np.hypot(*far.T).max() < 1.01 * limit * pixel + 1e-9
+
+
+def test_processes_that_draw_import_nothing_that_runs_are_made_with(run, tmp_path):
+    """What they receive, and the figures' functions, are of the report and the rooms below it."""
+    with Run.of(RunDirectory.open(run)) as opened:
+        drawn = to_be_drawn(opened)
+        sent = pickle.dumps((drawn, REPORT.items(drawn, "figure")))
+    path = tmp_path / "sent.pickle"
+    path.write_bytes(sent)
+    code = "import pickle, sys; _, items = pickle.load(open(sys.argv[1], 'rb')); print(len(items))"
+    code += "; print(*(name for name in sys.modules if name.startswith('bayesdist.app')))"
+    done = subprocess.run(
+        [sys.executable, "-c", code, path], capture_output=True, text=True, check=True
+    )
+    count, imported = done.stdout.split("\n")[:2]
+    assert int(count) > MIN_FIGURES_SHARED and not imported
