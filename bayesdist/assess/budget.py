@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from html import escape
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -70,6 +70,24 @@ class BudgetTerm:
         return replace(
             self, u=self.u[rows], v=self.v[rows], relative_error=relative_error, by_chip={}
         )
+
+
+class BudgetEntry(TypedDict):
+    """Row of an error budget: rms over the positions, in the unit of the budget."""
+
+    name: str
+    kind: str  # random, systematic, local, product or total
+    u: float
+    v: float
+    radial: float
+    radial_error: float | None  # uncertainty of `radial`; None if unknown
+    source: str
+
+
+class ChipBudgetEntry(BudgetEntry):
+    """Row of an error budget of a chip."""
+
+    chip: str  # number of the chip, or 'all'
 
 
 @dataclass(frozen=True, eq=False)
@@ -303,7 +321,7 @@ class ErrorBudget:
         gridded[np.searchsorted(y, self.y), np.searchsorted(x, self.x)] = values
         return gridded
 
-    def rows(self) -> list[dict[str, Any]]:
+    def rows(self) -> list[BudgetEntry]:
         """The budget as a list of rows: each term, each product, and the total last.
 
         The uncertainty of the total follows from those of its terms and is unknown if a term was
@@ -312,11 +330,11 @@ class ErrorBudget:
 
         Returns
         -------
-        list of dict
-            name, kind, u, v, radial (rms over the positions), radial_error (uncertainty of radial;
-            None if unknown), source.
+        list of BudgetEntry
+            Dictionaries of name, kind, u, v, radial (rms over the positions), radial_error
+            (uncertainty of radial; None if unknown), source.
         """
-        rows = []
+        rows: list[BudgetEntry] = []
         for t in self.every:
             mean_u, mean_v = float(np.mean(t.u**2)), float(np.mean(t.v**2))
             radial = (mean_u + mean_v) ** 0.5
@@ -344,18 +362,18 @@ class ErrorBudget:
             total["radial_error"] = spread / total["radial"] if complete else None
         return rows
 
-    def rows_by_chip(self) -> list[dict[str, Any]]:
+    def rows_by_chip(self) -> list[ChipBudgetEntry]:
         """Result of `rows`, followed by the rows of each chip; chip is 'all' or the chip number."""
         alone = zip(self.domain.chips, self.chips, strict=True)
         parts = [("all", self.rows()), *((str(chip), b.rows()) for chip, b in alone)]
-        return [{"chip": chip} | row for chip, rows in parts for row in rows]
+        return [{"chip": chip, **row} for chip, rows in parts for row in rows]
 
 
-def _relative_error(row: Mapping[str, Any]) -> float:
+def _relative_error(row: BudgetEntry) -> float:
     """Relative error of the radial size of a row; NaN if it is unknown."""
     if row["radial_error"] is None or not row["radial"] > 0:
         return float("nan")
-    return float(row["radial_error"] / row["radial"])
+    return row["radial_error"] / row["radial"]
 
 
 def budget_of(errors: DrawnErrors, domain: EvaluationDomain) -> ErrorBudget:

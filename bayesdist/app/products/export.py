@@ -19,7 +19,7 @@ from bayesdist.app.products.made_files import (
 )
 from bayesdist.app.products.release_set import release_set
 from bayesdist.app.run import Run
-from bayesdist.assess.budget import with_product
+from bayesdist.assess.budget import BudgetEntry, with_product
 from bayesdist.assess.terms.forms import PRODUCT
 from bayesdist.calibration.plane import ARCSEC
 from bayesdist.data.sky import sky_of_plane
@@ -128,7 +128,7 @@ def _left_out(key: str, product: ProductInput) -> tuple[str, ...]:
     )
 
 
-def _compare(product: dict[str, Any], budget: Sequence[dict[str, Any]]) -> None:
+def _compare(product: dict[str, Any], budget: Sequence[BudgetEntry]) -> None:
     """Add file errors from the budget to an entry, and the total error for users of the file."""
     for row in budget:
         files, _, direction = row["name"].rpartition(", ")

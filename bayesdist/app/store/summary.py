@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypedDict
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
@@ -396,7 +396,17 @@ class Summary(Sections):
     simulated: bool = Field(description="the input is simulated, as the configuration has it")
 
 
-def head_of(facts: Mapping[str, Any]) -> dict[str, Any]:
+class SummaryHead(TypedDict):
+    """Entries of summary.json about the run as a whole."""
+
+    bayesdist: str
+    kind: str
+    detector: str
+    began: str
+    simulated: bool
+
+
+def head_of(facts: Mapping[str, Any]) -> SummaryHead:
     """Entries of summary.json about the run as a whole."""
     config = facts["config"]
     kind = next(name for name in installed_kinds() if name in config)

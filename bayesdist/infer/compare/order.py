@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -292,6 +292,28 @@ class HeldOutOrders:
         return float(each.sum()), float(np.sqrt(variance))
 
 
+class OrderRow(TypedDict):
+    """Statistics of an order.
+
+    Those that compare it with the selected order are None for that order itself.
+    """
+
+    order: int
+    terms: int  # per axis
+    rms_u: float  # of the bins
+    rms_v: float
+    chi2_u: float  # per degree of freedom
+    chi2_v: float
+    p_noise: float  # the smaller of the probabilities of the two axes
+    F: float | None  # of the F-test against the selected order
+    p_surface: float | None
+    stars: float | None  # log density of the held-out stars minus that of the selected order
+    stars_error: float | None
+    regions: float | None  # the same for held-out regions
+    regions_error: float | None
+    lost: float
+
+
 @dataclass(frozen=True, eq=False)
 class OrderSelection:
     """Result of the selection of the polynomial order."""
@@ -310,42 +332,47 @@ class OrderSelection:
     n_used: int  # number of matches that were not clipped
     unit: str  # unit of `lost`, `pair_rms` and the surfaces
 
-    def rows(self) -> list[dict[str, Any]]:
-        """Statistics of each order as a list of dictionaries.
-
-        The keys are: order; terms (per axis); rms_u, rms_v of the bins; chi2_u, chi2_v per degree
-        of freedom; p_noise, the smaller of their two probabilities; F and p_surface of the F-test
-        between this order and the selected one; stars, stars_error, regions, regions_error: log
-        density of the held-out stars minus that of the selected order, with errors; lost.  Values
-        that compare with the selected order are None for that order itself.
-        """
+    def rows(self) -> list[OrderRow]:
+        """Statistics of each order."""
         noise, s = self.surfaces.p_noise(), self.surfaces
-        out = []
+        rows: list[OrderRow] = []
         for k, order in enumerate(self.orders):
-            statistics = {
-                "order": order,
-                "terms": (order + 1) * (order + 2) // 2,
-                "rms_u": float(s.rms[k, 0]),
-                "rms_v": float(s.rms[k, 1]),
-                "chi2_u": float(s.chi2[k, 0] / s.dof[k]),
-                "chi2_v": float(s.chi2[k, 1] / s.dof[k]),
-                "p_noise": float(noise[k].min()),
-            }
-            lost = 0.0 if order == self.orders[-1] else float(self.lost[k])  # no rounding error
-            out.append(statistics | self._against_chosen(order) | {"lost": lost})
-        return out
+            ratio, p_surface, stars, stars_error, regions, regions_error = self._against(order)
+            rows.append(
+                {
+                    "order": order,
+                    "terms": (order + 1) * (order + 2) // 2,
+                    "rms_u": float(s.rms[k, 0]),
+                    "rms_v": float(s.rms[k, 1]),
+                    "chi2_u": float(s.chi2[k, 0] / s.dof[k]),
+                    "chi2_v": float(s.chi2[k, 1] / s.dof[k]),
+                    "p_noise": float(noise[k].min()),
+                    "F": ratio,
+                    "p_surface": p_surface,
+                    "stars": stars,
+                    "stars_error": stars_error,
+                    "regions": regions,
+                    "regions_error": regions_error,
+                    # zero without a rounding error for the highest order
+                    "lost": 0.0 if order == self.orders[-1] else float(self.lost[k]),
+                }
+            )
+        return rows
 
-    def _against_chosen(self, order: int) -> dict[str, float | None]:
-        keys = ("F", "p_surface", "stars", "stars_error", "regions", "regions_error")
+    def _against(self, order: int) -> tuple[float | None, ...]:
+        """F and its probability, and differences of held-out stars and regions with their errors.
+
+        They compare an order with the selected one, for which all are None.
+        """
         if order == self.order:
-            return dict.fromkeys(keys)
+            return (None,) * 6
         low, high = sorted((order, self.order))
         sign = 1 if order == high else -1
         values = [*self.surfaces.f_test(low, high)]
         for held_out in (self.stars, self.regions):
             difference, error = held_out.difference(low, high)
             values += [sign * difference, error]
-        return dict(zip(keys, values, strict=True))
+        return tuple(values)
 
     @property
     def by_surfaces(self) -> int:

@@ -216,13 +216,12 @@ def _surfaces(ax: Axes, found: OrderSelection) -> None:
 
 def _held_out(ax: Axes, found: OrderSelection) -> None:
     rows = found.rows()
-    for k, (key, color, mark) in enumerate(
-        (("stars", PALETTE["blue"], "o"), ("regions", PALETTE["orange"], "D"))
+    stars = [(row["stars"] or 0.0, row["stars_error"] or 0.0) for row in rows]
+    regions = [(row["regions"] or 0.0, row["regions_error"] or 0.0) for row in rows]
+    for k, (key, pairs, color, mark) in enumerate(
+        (("stars", stars, PALETTE["blue"], "o"), ("regions", regions, PALETTE["orange"], "D"))
     ):
-        value, error = (
-            np.array([0.0 if row[name] is None else row[name] for row in rows], float)
-            for name in (key, f"{key}_error")
-        )
+        value, error = np.transpose(pairs)
         x = np.array(found.orders) + (2 * k - 1) * _APART
         ax.errorbar(x, value, error, fmt=mark, ms=4, lw=1.0, color=color, label=key)
     ax.axhline(0.0, lw=0.7, color="#9AA5B1", zorder=1)

@@ -138,7 +138,7 @@ def _compared(run: Run, orders: Sequence[int], chip: int | None) -> OrderSelecti
 
 def _rows(found: OrderSelection, failed: dict[int, str]) -> list[dict[str, Any]]:
     """One row per order, ascending; orders that cannot be fitted have only the number of terms."""
-    rows = found.rows()
+    rows: list[dict[str, Any]] = [{**row} for row in found.rows()]
     empty = dict.fromkeys(rows[0])
     unfitted = [empty | {"order": n, "terms": (n + 1) * (n + 2) // 2} for n in sorted(failed)]
     return rows + unfitted

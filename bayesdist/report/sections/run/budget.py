@@ -95,7 +95,7 @@ def _table(
     unit, mas = budget.unit, scale_mas(run)
     chips = {str(chip.number): chip.name for chip in run.model.chips} | {"all": "all"}
     together = [row for row in shown.rows() if not names or row["name"] in names]
-    rows = together
+    rows: Sequence[Mapping[str, Any]] = together
     if has_several_chips(run):
         rows = [row for row in shown.rows_by_chip() if not names or row["name"] in names]
     typical = row_per_axis(budget.rows()[-1])
