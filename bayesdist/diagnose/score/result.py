@@ -36,7 +36,7 @@ LEAST_LEFT = 0.2  # of what a few functions explain: less than that is left by t
 OF_FIELD = ("orders", "edges", "jumps", "rings", "repeating pattern")
 # polynomials of missing orders resemble these, and follow them in part
 STEEP = ("jumps", "rings", "repeating pattern")
-SKEWED = ("skewness by position", "skewness of a patch")
+SKEWED = ("displaced stars", "skewness by position", "skewness of a patch")
 OF_NOISE = ("noise by position", "noise by axis")
 OF_EXPOSURES = ("noise by exposure", *OF_NOISE)
 

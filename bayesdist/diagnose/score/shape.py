@@ -34,8 +34,9 @@ from bayesdist.utils.distributions import beta_sf, chi2_sf, norm_isf, norm_sf
 
 GROUP = "shape"
 REMEDY = (
-    "exposures or visits without a label, blends, ghosts, charge-transfer tails, or a match radius "
-    "that cuts true matches make such residuals: give the exposure of each star and fit frames, "
+    "exposures or visits without a label, stars whose proper motions are missing, blends, ghosts, "
+    "charge-transfer tails, or a match radius that cuts true matches make such residuals: give the "
+    "exposure of each star and fit frames, give proper motions with their errors and both dates, "
     "cut the stars that are displaced, or give u_nominal and v_nominal; a higher order or larger "
     "errors do not help"
 )
@@ -46,6 +47,11 @@ SKEWNESS = Family(
     "field",
     "the residuals are not lopsided in ways that differ over the field",
     group=GROUP,
+)
+APART = replace(
+    SKEWNESS,
+    name="displaced stars",
+    absent="no part of the stars is displaced from the others",
 )
 PATCH = replace(
     SKEWNESS,
@@ -94,6 +100,10 @@ WAVES = (
     3.2,
     3.6,
 )  # angular frequencies, in units of the inverse scatter along the main axis
+CLUMPS_CHANCE = 1e-3  # p-value of displaced stars below which their share is estimated
+CLEARLY_APART = 2.5  # scatters between two clumps whose shares can be told
+CLUMP_STEPS = 100
+WIDE = 12.0  # scatter of false matches beside the clumps, in units of the residuals'
 WAVE_REACH = 2.0  # width of the weights of the test for two cores, in units of that scatter
 
 
@@ -115,6 +125,7 @@ def shape_tests(sample: ScoredSample, chips: Sequence[ChipResiduals]) -> list[Ou
     skewness, correlation = _skewness(parts, unit), _correlation(parts, unit)
     tests = (
         skewness,
+        _apart(parts, unit),
         _patch(parts, unit),
         correlation,
         _both(skewness, correlation),
@@ -246,9 +257,9 @@ def _together(parts: list[_Part]) -> tuple[float, float, float | None, float]:
     return T, dof, None, float(chi2_sf(T, dof))
 
 
-def _displaced(chip: ChipResiduals) -> _Part | None:
-    """Displacement of the core from the rest of a chip's residuals, expanded in `TERMS`."""
-    F, change = _terms_of(chip), np.zeros((len(chip.X), 2 * len(TERMS)))
+def _displaced(chip: ChipResiduals, terms: Sequence[tuple[int, int]] = TERMS) -> _Part | None:
+    """Displacement of the core from the rest of a chip's residuals, expanded in `terms`."""
+    F, change = legendre_products(chip.X, chip.Y, terms), np.zeros((len(chip.X), 2 * len(terms)))
     for sign, (score, derivative) in zip((1, -1), _displacements(chip.z), strict=True):
         try:
             inverse = np.linalg.inv((F * derivative[:, None]).T @ F)
@@ -256,7 +267,69 @@ def _displaced(chip: ChipResiduals) -> _Part | None:
             return None
         step = F @ inverse
         change = change + sign * np.concatenate([step * axis[:, None] for axis in score], axis=1)
-    return _Part.of(change * chip.sigma, chip.star, np.tile(AREA, 2))
+    return _Part.of(change * chip.sigma, chip.star, np.tile(AREA[: len(terms)], 2))
+
+
+def _apart(chips: list[ChipResiduals], unit: str) -> Outcome | None:
+    """Test whether the core is displaced from the rest of the residuals, equally over the field.
+
+    It is the constant of `_skewness` alone, for stars that are displaced as a whole by the same
+    amount, such as those without a proper motion.
+    """
+    parts = [part for chip in chips if (part := _displaced(chip, TERMS[:1])) is not None]
+    if not parts:
+        return None
+    T, dof, dof_residual, p_value = _together(parts)
+    square, noise = np.mean([part.squares for part in parts], axis=0)
+    clumps = [_clumps(chip) for chip in chips] if p_value < CLUMPS_CHANCE else []
+    present = "a part of the stars is displaced from the others, everywhere in the same direction"
+    share = np.mean([clump.share for clump in clumps]) if clumps else 0.0
+    if clumps and min(clump.separation for clump in clumps) > CLEARLY_APART:
+        pairs = zip(clumps, chips, strict=True)
+        away = np.mean([clump.distance * chip.sigma for clump, chip in pairs])
+        present = (
+            f"some {100 * share:.2g} % of the stars are displaced from the others, by {away:.2g} "
+            f"{unit} everywhere in the same direction"
+        )
+    family = replace(APART, present=present)
+    return outcome(family, T, dof, dof_residual, p_value, square=square, noise=noise, unit=unit)
+
+
+@dataclass(frozen=True)
+class _Clumps:
+    """Two clumps of residuals."""
+
+    share: float  # of the smaller clump
+    distance: float  # of the middles of both, in the unit of the residuals
+    separation: float  # the same in units of the scatter of the larger one
+
+
+def _clumps(chip: ChipResiduals) -> _Clumps:
+    """Two clumps of the residuals of a chip, by expectation and maximisation.
+
+    Both are normal with a scatter of their own, and a wide one contains false matches.
+    """
+    z = chip.z
+    core, rest = _displacements(z)
+    # from the core towards the remaining residuals
+    way = rest[0].mean(axis=1) / rest[1].mean() - core[0].mean(axis=1) / core[1].mean()
+    way = way / np.hypot(*way)
+    middles = np.stack([-0.5 * way, 1.5 * way])
+    sizes, shares = np.array([1.0, 1.0]), np.array([0.6, 0.3])
+    for _ in range(CLUMP_STEPS):
+        square = ((z[None] - middles[:, :, None]) ** 2).sum(axis=1)
+        density = (shares / sizes**2)[:, None] * np.exp(-0.5 * square / sizes[:, None] ** 2)
+        wide = (1.0 - shares.sum()) / WIDE**2 * np.exp(-0.5 * (z**2).sum(axis=0) / WIDE**2)
+        weight = density / (density.sum(axis=0) + wide + np.finfo(float).tiny)
+        total = np.maximum(weight.sum(axis=1), 1.0)
+        middles = (weight @ z.T) / total[:, None]
+        square = ((z[None] - middles[:, :, None]) ** 2).sum(axis=1)
+        sizes = np.clip(np.sqrt((weight * square).sum(axis=1) / (2 * total)), 0.1, WIDE / 2)
+        shares = np.minimum(total / z.shape[1], 0.99)
+        shares = shares / max(1.0, shares.sum() / 0.999)
+    larger = int(np.argmax(shares))
+    away = float(np.hypot(*(middles[1] - middles[0])))
+    return _Clumps(float(shares.min() / shares.sum()), away, away / float(sizes[larger]))
 
 
 def _correlation(chips: list[ChipResiduals], unit: str) -> Outcome | None:

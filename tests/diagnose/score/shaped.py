@@ -17,7 +17,7 @@ CHIP = Chip(1, "A", (SIDE, SIDE), (SIDE / 2, SIDE / 2))
 SIGMA = 0.02  # px
 SHAPE = (
     *("skewness by position", "skewness of a patch", "correlation by position", "two cores"),
-    "shape by position",
+    *("shape by position", "displaced stars"),
 )
 
 Noise = Callable[[np.random.Generator, int], np.ndarray]
@@ -99,6 +99,16 @@ def two_visits(apart: float, share: Callable[[np.ndarray], np.ndarray], turned: 
         second = rng.uniform(size=len(x)) < share(scaled(x))
         rotation = turned * np.stack([-scaled(y), scaled(x)], axis=1)
         return second[:, None] * (apart * direction(rng) + rotation)
+
+    return displaced
+
+
+def third(apart: float, own: float = 0.0):
+    """A third of the stars has moved, all by the same distance and each by its own motion (px)."""
+
+    def displaced(rng, x, y):
+        hit = rng.uniform(size=len(x)) < 1 / 3
+        return hit[:, None] * (apart * direction(rng) + own * gaussian(rng, len(x)))
 
     return displaced
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from types import SimpleNamespace
 
 import numpy as np
@@ -30,6 +31,7 @@ from .shaped import (
     student,
     student_by_axis,
     tail,
+    third,
     true_map,
     two_visits,
     unequal,
@@ -57,6 +59,43 @@ def test_displaced_stars_are_found(name):
     assert found[test].group == "shape" and "without a label" in found[test].remedy
 
 
+# displacement and own motions of a third of the stars in errors, number of stars, and the least
+# fraction of 20 truths that is found, after the correction for the number of tests; 32 mas are
+# eight errors of 0.02 px of 200 mas
+POWER = {
+    "three errors, few": (3.0, 0.0, 300, 0.4),
+    "three errors": (3.0, 0.0, 1000, 1.0),
+    "32 mas, few": (8.0, 0.0, 300, 1.0),
+    "32 mas, own motions": (8.0, 2.0, 1000, 1.0),
+    "own motions alone": (0.0, 3.0, 1000, None),
+}
+
+
+@pytest.mark.parametrize("name", POWER)
+def test_a_third_of_the_stars_without_motions_is_found_if_it_is_displaced(name, full, capsys):
+    """With its share and its distance, and with advice on motions; not if nothing has moved."""
+    apart, own, n, least = POWER[name]
+    found = [
+        examined(scene(np.random.default_rng([46, k]), n, third(apart * SIGMA, own * SIGMA)))
+        for k in range(20 if full else 5)
+    ]
+    tests = [one["displaced stars"] for one in found]
+    share = np.mean([test.significant for test in tests])
+    with capsys.disabled():
+        print(f"\n{name}: {share:.2f} found, median p {np.median([t.p_value for t in tests]):.1g}")
+    if least is None:
+        assert not share and min(one[test].p_value for one in found for test in SHAPE) > 1e-4
+        return
+    assert share >= least - (0.0 if full or least == 1.0 else 0.2)
+    significant = [test for test in tests if test.significant]
+    assert all("give proper motions with their errors" in test.remedy for test in significant)
+    if apart == 8.0:
+        words = [re.search(r"some (\d+) % .* by ([\d.]+) pix", test.finding) for test in tests]
+        shares, distances = np.array([word.groups() for word in words], float).T
+        assert shares.mean() == pytest.approx(100 / 3, abs=4)
+        assert distances.mean() == pytest.approx(8.0 * SIGMA, rel=0.12)
+
+
 def test_two_tests_together_find_what_each_alone_would_miss():
     """Visits that differ by 2.5 errors, in so few stars that half of the cases are found."""
     displaced = two_visits(0.05, lambda X: 0.5 + 0.4 * X)
@@ -80,6 +119,7 @@ def test_a_halo_of_false_matches_is_found_where_it_is():
     assert np.hypot(*(np.array(named, float) - expected)) < 300
 
 
+EVEN = (*SHAPE[::2], "displaced stars")  # the others are larger than chance
 # noise, fraction of false matches, their circle, stars, order
 INSIDE = {
     "few": (gaussian, 0.04, None, 200, 3),
@@ -109,7 +149,7 @@ def test_probabilities_are_even_inside_the_family(full):
         p = np.array([values[test] for values in found])
         assert_no_smaller_than_chance(test, p)
         assert p.min() > 1e-3 / len(p)
-        if test in SHAPE[::2]:
+        if test in EVEN:
             assert_even(test, p)
             if full:
                 assert stats.kstest(p, "uniform").pvalue > 1e-3
