@@ -201,8 +201,8 @@ def check_requirements(
         'mean' for a position in the mean of the exposures; 'single' for one in a single exposure.
     aligned : bool
         True if the observer fits shift and rotation of the exposure; see `ErrorModel`. They are
-        fitted over all chips, even if only one chip is judged. Terms that are not polynomials are
-        unchanged.
+        fitted over all chips, even if only one chip is judged. Errors that are independent between
+        stars are unchanged.
     grid : tuple of int
         Number of points along x and y of each chip.
     epoch : float, Time or str, optional

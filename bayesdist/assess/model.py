@@ -51,8 +51,8 @@ class ErrorModel:
         Errors that are independent of the solution and of each other, in the unit of the solution.
     aligned : bool
         True if the star is observed in a new exposure and the observer fits its shift and rotation.
-        The errors then exclude the frames of the solution, and a shift and rotation common to all
-        chips. Terms that are not polynomials are unchanged.
+        The errors then exclude the frames of the solution, and the shift and rotation common to all
+        chips that this fit absorbs; errors that are independent between stars are unchanged.
     """
 
     solution: SolutionErrors

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import bayesdist as bd
 from bayesdist.assess import Catalogue
+from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.model import error_model
 from bayesdist.assess.terms.catalogue import PUBLISHED_SYSTEMATICS
 from bayesdist.errors import InputError
@@ -50,9 +53,12 @@ def pixels(solution_of):
     return make
 
 
-def drawn(solution, catalogue, dates=(EPOCH,), *, scale=50.0, bright=0.0, n=N, seed=1):
+def drawn(
+    solution, catalogue, dates=(EPOCH,), *, scale=50.0, bright=0.0, n=N, seed=1, aligned=False
+):
     term = catalogue.term(np.array(dates), bright)
-    return error_model(solution, [term], pixel_scale=scale).drawn(n, np.random.default_rng(seed))
+    errors = error_model(solution, [term], pixel_scale=scale, aligned=aligned)
+    return errors.drawn(n, np.random.default_rng(seed))
 
 
 def summed(fields, names):
@@ -88,6 +94,94 @@ def test_draws_have_the_published_covariance_at_any_separation(pixels, scale):
         assert np.median(ratio) == pytest.approx(1.0, abs=0.05)
         assert np.all((ratio > 0.6) & (ratio < 1.6))
     assert abs(np.mean(errors[:n, :, 0] * errors[:n, :, 1])) < 0.1 * expected[0, 0]
+
+
+def even_stars(nx, ny):
+    """Pixels that cover a chip evenly."""
+    centres = (0.5 + (np.arange(k) + 0.5) * n / k for n, k in zip(SIZE, (nx, ny), strict=True))
+    return tuple(a.ravel() for a in np.meshgrid(*centres))
+
+
+def panstarrs_positions(theta):
+    """Magnier et al. 2020 and Lubow et al. 2021; mas^2 and degrees."""
+    return 5.0**2 + 11.5**2 * np.exp(-theta * 60.0)
+
+
+@pytest.mark.parametrize(
+    ("catalogue", "covariance", "scale"),
+    [
+        ("Gaia DR3", gaia_positions, 50.0),
+        ("Pan-STARRS", panstarrs_positions, 20.0),
+        ("Pan-STARRS", panstarrs_positions, 250.0),
+    ],
+)
+def test_errors_that_exposures_absorb_by_shift_and_rotation_are_not_stated(
+    pixels, catalogue, covariance, scale
+):
+    """Fields of V(theta) on both chips, to whose stars shift and rotation are fitted."""
+    x, y = (
+        a.ravel()
+        for a in np.meshgrid(
+            (np.arange(14) + 0.5) * SIZE[0] / 14, (np.arange(7) + 0.5) * SIZE[1] / 7
+        )
+    )
+    u, v = np.tile(x, 2), np.concatenate([y, y + 1100.0])
+    theta = np.hypot(u[:, None] - u, v[:, None] - v) * scale / 3.6e6
+    root = np.linalg.cholesky(covariance(theta) / scale**2)
+    rng, zero, one = np.random.default_rng(5), np.zeros_like(u), np.ones_like(u)
+    errors = np.concatenate([root @ rng.standard_normal((len(u), 2000)) for _ in range(2)])
+    fitted = np.stack([np.r_[one, zero], np.r_[zero, one], np.r_[-v, u]], axis=1)
+    rest = errors - fitted @ np.linalg.lstsq(fitted, errors)[0]
+    draws = drawn(pixels(2), Catalogue(catalogue), scale=scale, aligned=True)
+    squares, plain = (
+        np.concatenate(
+            [
+                sum(np.square(fields.sigma(name)) for name in fields.parts if catalogue in name).T
+                for fields in (fields_at(d, x, y, chip=chip) for chip in (1, 2))
+            ]
+        )
+        for d in (draws, drawn(pixels(2), Catalogue(catalogue), scale=scale))
+    )
+    simulated = np.mean(rest.reshape(2, len(u), -1) ** 2, axis=2).T
+    assert np.sqrt(squares.mean() / simulated.mean()) == pytest.approx(1.0, abs=0.05)
+    np.testing.assert_allclose(np.sqrt(squares / simulated), 1.0, atol=0.2)
+    assert plain.mean() > 1.15 * squares.mean()
+
+
+def test_an_offset_and_a_smooth_field_are_aligned_as_least_squares_does(pixels):
+    """One offset vanishes; of smooth fields, independent on each chip, the fitted part does."""
+    solution, model = pixels(2), pixels(2).model
+    term = bd.UserTerm("Gaia", "systematic", 0.01, 0.02, "pix")
+    smooth, noise = term.treatments(model, None)
+    x, y = even_stars(40, 40)
+    domain = EvaluationDomain(model, np.repeat([1, 2], len(x)), np.tile(x, 2), np.tile(y, 2))
+    found = {}
+    for name, kind in (("offset", term), ("smooth", smooth), ("noise", noise)):
+        for aligned in (False, True):
+            errors = error_model(solution, [kind], pixel_scale=50.0, aligned=aligned)
+            found[name, aligned] = errors.drawn(500, np.random.default_rng(2))
+    row = slice(0, 500)
+    offset = found["offset", True].errors(domain)(row, np.zeros(1))
+    assert np.all(offset == 0.0)
+    u, v = np.tile(x, 2), np.concatenate([y, y + 1100.0])
+    zero, one = np.zeros_like(u), np.ones_like(u)
+    fitted = np.stack(
+        [np.stack([one, zero], 1), np.stack([zero, one], 1), np.stack([-v, u], 1)], axis=2
+    ).reshape(-1, 3)
+    before, after = (found["smooth", a].errors(domain)(row, np.zeros(1)) for a in (False, True))
+    before = before.reshape(500, -1).T
+    expected = (before - fitted @ np.linalg.lstsq(fitted, before)[0]).T.reshape(after.shape)
+    # 1600 stars of a chip in place of an integral
+    np.testing.assert_allclose(after, expected, atol=0.005 * before.std())
+    few = replace(domain, chip=domain.chip[::97], x=domain.x[::97], y=domain.y[::97])
+    for relative in ("", "pairs"):
+        at = replace(few, relative=relative)
+        [field] = [f for f in found["smooth", True].at(at) if f.rows and f.rows[0].name == "Gaia"]
+        np.testing.assert_allclose(
+            np.sqrt(field.total()), np.sqrt(field.by_draws(row)), rtol=6 / np.sqrt(2 * 500)
+        )
+    noise = [d.at(few)[-1].total() for d in (found["noise", False], found["noise", True])]
+    np.testing.assert_array_equal(noise[0], noise[1])
 
 
 PAIRS = [(i, j) for i in range(80) for j in range(i)]

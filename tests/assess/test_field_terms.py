@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from bayesdist.assess import LocalErrors, Requirement, UserTerm, check_requirements
+from bayesdist.assess.alignment import Alignment
 from bayesdist.assess.model import error_model
-from bayesdist.assess.terms.forms import without_rigid
 from bayesdist.assess.terms.parameters import (
     MOTIONS,
     CatalogueErrors,
@@ -242,7 +242,7 @@ def test_shift_and_rotation_are_no_error(solution_of):
         shift = np.zeros((2, model.n_terms))
         shift[:, 0] = 0.3, -0.2
         errors[chip] = np.stack([shift, np.stack([-v, u]), shift + 2 * np.stack([-v, u])])
-    for rest in without_rigid(errors, positions, model).values():
+    for rest in Alignment(model, positions).without(errors).values():
         assert np.abs(rest).max() < 1e-9
 
 
@@ -251,7 +251,7 @@ def test_what_is_left_is_what_least_squares_leaves(solution_of):
     model, theta = scattering()
     mean = {c: np.stack([theta[model.coefficient_slice(c, a)] for a in (0, 1)]) for c in (1, 2)}
     errors = {c: rng(c).normal(size=(3, 2, model.n_terms)) for c in (1, 2)}
-    rest = without_rigid(errors, mean, model)
+    rest = Alignment(model, mean).without(errors)
     # nodes of Gauss and Legendre: sums over such stars are integrals over the chips
     nodes, weights = np.polynomial.legendre.leggauss(8)
     x, y = (a.ravel() for a in np.meshgrid(2048.5 + 2048 * nodes, 1024.5 + 1024 * nodes))

@@ -192,7 +192,10 @@ def _exposures(
     """Clause on the exposures for which the position is valid."""
     n = len(model.exposures)
     if aligned:
-        return f"a position in a new exposure, which deviates as {n} exposures do"
+        return (
+            f"a position in a new exposure, which deviates as {n} exposures do and whose shift and "
+            "rotation are fitted, so that errors common to the whole field vanish"
+        )
     linear = None if correlated is None else correlated.linear
     if linear is None or "shape" not in linear.scatter:
         return f"{n} exposures" if n > 1 else "one exposure, or the mean of several"

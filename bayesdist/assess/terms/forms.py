@@ -20,17 +20,18 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property, reduce
+from functools import cached_property, partial, reduce
 from typing import ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.assess.alignment import Alignment
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.solution import place_of
 from bayesdist.calibration.chip_map import position_moments
+from bayesdist.errors import required
 from bayesdist.model import DistortionModel
-from bayesdist.model.alignment import mean_squares
 from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh
 from bayesdist.utils.arrays import Float, Int
 
@@ -287,35 +288,6 @@ def polynomial_errors(
     return np.asarray(np.linalg.solve(model.frame(mean, exposure)[0], error), float)
 
 
-def without_rigid(
-    errors: Mapping[int, Float], positions: Mapping[int, Float], model: DistortionModel
-) -> dict[int, Float]:
-    """Subtract the best-fitting shift and rotation of the whole detector from error fields.
-
-    Observers who apply a calibration to an exposure fit its pointing. The part of an error that
-    this fit absorbs is not an error, and it depends on the gauge; the residual is the same in every
-    gauge.
-
-    `errors`: Legendre coefficients (n, 2, K) of each error by chip number, for all chips of the
-    model. `positions`: coefficients (2, K) of the positions (u, v) in the same orientation. Returns
-    the residual errors (n, 2, K) of a least-squares fit to stars that cover all chips evenly.
-    """
-    chips = model.chips
-    weight = mean_squares(model).reshape(len(chips), 2, -1)
-    rigid = np.zeros((3, *weight.shape))
-    rigid[0, :, 0, 0] = rigid[1, :, 1, 0] = 1.0
-    for c, chip in enumerate(chips):
-        u, v = positions[chip.number]
-        rigid[2, c] = -v, u
-    # shift the origin to the mean position, so that rotation and shifts are orthogonal
-    rigid[2, ..., 0] -= np.einsum("ca,ca->a", weight[..., 0], rigid[2, ..., 0])
-    stacked = np.stack([errors[chip.number] for chip in chips], axis=1)
-    normal = np.einsum("pcak,cak,qcak->pq", rigid, weight, rigid)
-    projected = np.einsum("pcak,ncak->np", rigid * weight, stacked)
-    residual = stacked - np.einsum("np,pcak->ncak", np.linalg.solve(normal, projected.T).T, rigid)
-    return {chip.number: residual[:, c] for c, chip in enumerate(chips)}
-
-
 @dataclass(frozen=True, eq=False)
 class Polynomials:
     """Errors of parameters, which are polynomials for each chip and epoch."""
@@ -365,11 +337,7 @@ class PolynomialField(DrawnField):
         if mean is None:
             return cls(rows, domain, {chip: coefficients(chip) for chip in domain.chips})
         all_coefficients = {chip.number: coefficients(chip.number) for chip in model.chips}
-        positions = {
-            chip: place_of(model, epoch=domain.epoch, chip=chip).polynomial(mean)
-            for chip in all_coefficients
-        }
-        return cls(rows, domain, without_rigid(all_coefficients, positions, model))
+        return cls(rows, domain, Alignment.of(model, mean, domain.epoch).without(all_coefficients))
 
     @property
     def n_draws(self) -> int:
@@ -418,16 +386,36 @@ class Functions:
     # the uncertainty of their size is unknown
     covariance: Mapping[int | None, Float] | None = None
     pools: tuple[Pool, ...] = ()  # finite sets from which the coefficients are taken
-    _cache: dict[EvaluationDomain, FunctionField] = field(default_factory=dict, repr=False)
+    _cache: dict[tuple[EvaluationDomain, bytes], FunctionField] = field(
+        default_factory=dict, repr=False
+    )
 
     def on(self, domain: EvaluationDomain, image: Image) -> FunctionField:
-        """Errors at the positions of a domain; the most recent ones are cached."""
-        key = domain.at(None)
+        """Errors at the positions of a domain, without the part that an alignment absorbs.
+
+        The most recent ones are cached.
+        """
+        mean = image.aligned_by
+        key = domain.at(None), b"" if mean is None else mean.tobytes()
         if key not in self._cache:
             self._cache.clear()
-            # without this cache, since a reference cycle would keep large arrays in memory
-            self._cache[key] = FunctionField((self.row,), key, replace(self, _cache={}))
+            self._cache[key] = self._aligned(key[0], mean)
         return self._cache[key]
+
+    def _aligned(self, domain: EvaluationDomain, mean: Float | None) -> FunctionField:
+        """Errors at the positions of a domain; `mean` are the `aligned_by` of the image."""
+        # without this cache, since a reference cycle would keep large arrays in memory
+        of = replace(self, _cache={})
+        if mean is None:
+            return FunctionField((self.row,), domain, of)
+        if self.uniform:  # a shift is absorbed exactly
+            chips = {k: 0.0 * c for k, c in self.coefficients.items()}
+            covariance = self.covariance and {k: 0.0 * c for k, c in self.covariance.items()}
+            of = replace(of, coefficients=chips, covariance=covariance)
+            return FunctionField((self.row,), domain, of)
+        # drifts change positions too little to matter for the rotation
+        epoch = None if domain.model.time is None else domain.model.time.epoch0[0]
+        return FunctionField((self.row,), domain, of, Alignment.of(domain.model, mean, epoch))
 
     def of(self, chip: int) -> NDArray[np.floating] | None:
         """Coefficients (n', 2, m) on a chip; None if there is no error."""
@@ -449,6 +437,7 @@ class FunctionField(DrawnField):
     """Sums of functions at the positions of a domain."""
 
     of: Functions
+    alignment: Alignment | None = None  # the shift and rotation that it fits are subtracted
 
     @property
     def n_draws(self) -> int:
@@ -486,8 +475,40 @@ class FunctionField(DrawnField):
             drawn = _of_draws(values, draws)
             parts.append(drawn if phi is None else np.swapaxes(drawn @ phi.T, 1, 2))
         out = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
+        if self.alignment is not None:
+            absorbed = _of_draws(self._absorbed, draws) @ self._rigid.reshape(-1, 3).T
+            out = out - absorbed.reshape(len(absorbed), -1, 2)
         size = scale.get(self.of.row.name, 1.0)
         return np.asarray(out if size == 1.0 else size * out, float)
+
+    @cached_property
+    def _fits(self) -> dict[int, Float]:
+        """Shifts and rotation (3, 2, m) fitted to each function, by number of a chip with errors.
+
+        Empty without an alignment.
+        """
+        if self.alignment is None:
+            return {}
+        chips = (chip.number for chip in self.domain.model.chips)
+        fit = partial(self.alignment.fitted, functions=self.of.functions)
+        return {chip: fit(chip) for chip in chips if self.of.of(chip) is not None}
+
+    @cached_property
+    def _absorbed(self) -> Float:
+        """Shifts and rotation (n', 3) fitted to the errors of each row of coefficients."""
+        by_chip = [
+            np.einsum("nam,pam->np", self.of.of(chip), fit) for chip, fit in self._fits.items()
+        ]
+        every = slice(0, max((len(fitted) for fitted in by_chip), default=1))
+        return sum((_of_draws(fitted, every) for fitted in by_chip), np.zeros((1, 3)))
+
+    @cached_property
+    def _rigid(self) -> Float:
+        """Both shifts and the rotation (N, 2, 3) at the positions of the domain."""
+        at, alignment = self.domain, required(self.alignment, "there is no alignment")
+        return np.concatenate(
+            [alignment.at(chip, at.x[rows], at.y[rows]) for chip, rows in at.by_chip()]
+        )
 
     def total(self) -> Float:
         """Mean squares (P, 2), from the covariance or over all rows of coefficients."""
@@ -498,21 +519,35 @@ class FunctionField(DrawnField):
     def _stated(self, covariance: Mapping[int | None, Float]) -> Float:
         """Mean squares (P, 2) from the covariance of the coefficients."""
         at, pairs = self.domain, self.domain.pairs()
+        root = {chip: _roots(of_chip) for chip, of_chip in covariance.items()}
         # along u and v: functions (2, N, m) whose coefficients are independent, of unit variance
         functions = np.concatenate(
             [
                 np.asarray(self.of.functions(chip, at.x[rows], at.y[rows]), float)
-                @ _roots(covariance[chip if chip in covariance else None])
+                @ root[chip if chip in covariance else None]
                 for chip, rows in at.by_chip()
             ],
             axis=1,
         )
+        crossed = np.zeros(0)
+        if self.alignment is not None:
+            functions, crossed = self._without_rigid(functions, root)
         squares = np.square(functions).sum(axis=2).T
         if pairs is None:
             return np.asarray(squares)
         first, second = pairs
         out = squares[first] + squares[second]  # of chips whose coefficients are independent
-        common = np.flatnonzero((at.chip[first] == at.chip[second]) | (None in covariance))
+        alike = (at.chip[first] == at.chip[second]) | (None in covariance)
+        if self.alignment is not None:  # the shift and rotation of both chips are common
+            apart = np.flatnonzero(~alike)
+            to_first, to_second = (
+                np.einsum("nap,nap->na", self._rigid[i[apart]], crossed[j[apart]])
+                for i, j in ((first, second), (second, first))
+            )
+            rigid = [self._rigid[i[apart]] for i in (first, second)]
+            joint = np.einsum("nap,pq,naq->na", rigid[0], self._shared(root), rigid[1])
+            out[apart] += 2.0 * (to_first + to_second - joint)
+        common = np.flatnonzero(alike)
         step = max(1, BLOCK // functions.shape[2])
         for start in range(0, len(common), step):
             rows = common[start : start + step]
@@ -520,13 +555,56 @@ class FunctionField(DrawnField):
             out[rows] = np.square(differences).sum(axis=2).T
         return np.asarray(out)
 
+    def _unit_fits(self, root: Mapping[int | None, Float]) -> dict[int | None, Float]:
+        """Shifts and rotation (2, 3, m) of unit functions of each axis, by key of the covariance.
+
+        `root` has the matrices that `_roots` returns.
+        """
+        out: dict[int | None, Float] = {}
+        for chip, fit in self._fits.items():
+            key = chip if chip in root else None
+            out[key] = out.get(key, 0.0) + np.einsum("pam,amk->apk", fit, root[key])
+        return out
+
+    def _shared(self, root: Mapping[int | None, Float]) -> Float:
+        """Covariance (3, 3) of the fitted shifts and rotation."""
+        fits = self._unit_fits(root).values()
+        return np.asarray(sum(np.einsum("apk,aqk->pq", fit, fit) for fit in fits))
+
+    def _without_rigid(
+        self, functions: Float, root: Mapping[int | None, Float]
+    ) -> tuple[Float, Float]:
+        """Functions (2, N, m + 3) of the errors after alignment, for unit coefficients.
+
+        The last three are the part of the fit that is due to the other axis and to other chips.
+        The second result is the covariance (N, 2, 3) of errors with the fitted shifts and rotation.
+        """
+        at, fits = self.domain, self._unit_fits(root)
+        squares = {key: np.einsum("apk,aqk->apq", fit, fit) for key, fit in fits.items()}
+        aligned, crossed = [], []
+        for chip, rows in at.by_chip():
+            key = chip if chip in root else None
+            rigid = np.swapaxes(self._rigid[rows], 0, 1)  # (2, n, 3)
+            fit = fits.get(key, np.zeros((2, 3, functions.shape[2])))
+            of_others = sum((sq for k, sq in squares.items() if k != key), np.zeros((2, 3, 3)))
+            rest = of_others.sum(axis=0) + squares.get(key, np.zeros((2, 3, 3)))[::-1]
+            aligned.append(
+                np.concatenate([functions[:, rows] - rigid @ fit, rigid @ _roots(rest)], axis=2)
+            )
+            crossed.append(functions[:, rows] @ np.swapaxes(fit, 1, 2))
+        return np.concatenate(aligned, axis=1), np.swapaxes(np.concatenate(crossed, axis=1), 0, 1)
+
     def relative_error(self, chip: int, monte_carlo: float) -> float | None:
         """Relative scatter of the rms of each draw over the chip; None if the size is stated."""
         if self.of.covariance is not None:
             return None
         model = self.domain.model
         size = model.chips[model.chip_code(chip)].size
-        values = self.of.values(chip, *mesh(*grid_pixels(size, DEFAULT_GRID)))
+        x, y = mesh(*grid_pixels(size, DEFAULT_GRID))
+        values = self.of.values(chip, x, y)
+        if self.alignment is not None:
+            absorbed = self._absorbed @ self.alignment.at(chip, x, y).reshape(-1, 3).T
+            values = values - absorbed.reshape(len(absorbed), -1, 2)
         by_draw = np.sqrt(np.mean(np.square(values, dtype=float), axis=(1, 2)))
         mean = float(by_draw.mean())
         return float(by_draw.std()) / mean if mean > 0 else 0.0
