@@ -13,7 +13,7 @@ from astropy.table import Table
 from bayesdist.data.covariances import without_sizes
 from bayesdist.data.detections import Detections
 from bayesdist.data.formats.files import exposure_names, input_files, kind_of, mission_formats
-from bayesdist.data.reading.centroids import pixel_covariances, with_variances
+from bayesdist.data.reading.centroids import check_ellipses, pixel_covariances, with_variances
 from bayesdist.data.reading.columns import CENTROIDS
 from bayesdist.data.repeated import first_duplicate
 from bayesdist.data.tables.checks import COMPLETED, counted, row_number
@@ -195,7 +195,8 @@ def _of_table(
     table: Table, columns: Mapping[str, str] | None, source: str, name: str, errors: bool
 ) -> list[Detections]:
     """Detections of each exposure of a table."""
-    table = with_variances(table, source) if errors else table
+    original = table
+    table = with_variances(table) if errors else table
     column_names = find_columns(
         table.colnames,
         columns,
@@ -204,6 +205,8 @@ def _of_table(
         pairs=[("x", "y"), ("sigma_x", "sigma_y")],
         needed=("x", "y", "sigma_x", "sigma_y") if errors else ("x", "y"),
     )
+    if errors:
+        check_ellipses(original, column_names, source)
     if not len(table):
         raise InputError("holds no detections", where=source, do="give a list with stars")
 

@@ -41,6 +41,7 @@ from bayesdist.data.columns import (
 from bayesdist.data.formats.files import exposure_names, input_files
 from bayesdist.data.matches import Matches
 from bayesdist.data.output import geometry_header, header_arguments
+from bayesdist.data.reading.centroids import ellipse_columns
 from bayesdist.data.reading.columns import (
     columns_read,
     match_columns,
@@ -389,6 +390,13 @@ def stored_file(
     """
     source = part.name
     column_names, options, notes = columns_read(part.colnames, {}, options, source=source)
+    ellipse = ellipse_columns(part.colnames)
+    if options.read_sigma and "sigma_u" not in column_names and ellipse is not None:
+        raise InputError(
+            f"error ellipses ({', '.join(ellipse[0])}) are not converted in tables on disk",
+            where=source,
+            do=f"write the variances as {', '.join(ellipse[1])}, or set data.sigma to a number",
+        )
     column_names.pop("flux", None)  # magnitudes would require the fluxes of all rows to be positive
     refuse_half(("sigma_u", "sigma_v"), column_names, where=source, what="errors")
     nominal_columns(column_names, source=source, tangent_point=options.tangent_point)

@@ -125,6 +125,12 @@ def test_sextractor_has_ellipses(rng, kind):
     table[f"ERRB{kind}_IMAGE"][6] = 0.0
     with pytest.raises(InputError, match=f"row 7, column 'ERRB{kind}_IMAGE'"):
         matches_from_table(table, ReadOptions(unit="arcsec"))
+    # errors that are not used are not refused
+    for options in ({"sigma": "by_magnitude"}, {"sigma": 0.01}):
+        assert len(matches_from_table(table, ReadOptions(unit="arcsec", **options))) == N
+    with_own = table.copy()
+    with_own["sigma_u"] = with_own["sigma_v"] = 0.01
+    assert np.all(matches_from_table(with_own, ReadOptions(unit="arcsec")).sigma_u == 0.01)
     # errors of another program stand beside them
     table["x_err"] = table["y_err"] = 0.01
     table.remove_columns([f"ERRX2{kind}_IMAGE", f"ERRY2{kind}_IMAGE"])
@@ -139,6 +145,22 @@ def test_stars_on_disk_have_the_same_errors(rng, tmp_path):
     here = matches_from_table(table, ReadOptions(unit="arcsec"))
     for name in ("sigma_u", "sigma_v", "rho_uv"):
         np.testing.assert_allclose(getattr(stored, name), getattr(here, name), rtol=1e-12)
+
+
+def test_ellipses_on_disk_are_refused_and_variances_are_read(rng, tmp_path):
+    table = stars(rng)
+    table["ERRA_IMAGE"], table["ERRB_IMAGE"] = 0.04, 0.01
+    table["ERRTHETA_IMAGE"] = 0.0
+    table.write(tmp_path / "ellipses.parquet")
+    with pytest.raises(InputError, match=r"ERRA_IMAGE, .* write the variances as errx2_image"):
+        open_matches(tmp_path / "ellipses.parquet", unit="arcsec")
+    open_matches(tmp_path / "ellipses.parquet", unit="arcsec", sigma=0.01)
+    here = matches_from_table(table, ReadOptions(unit="arcsec"))
+    table["errx2_image"], table["erry2_image"] = 0.04**2, 0.01**2
+    table["errxy_image"] = 0.0
+    table.write(tmp_path / "variances.parquet")
+    stored = open_matches(tmp_path / "variances.parquet", unit="arcsec").load()
+    np.testing.assert_allclose(covariances(stored), covariances(here), rtol=1e-9, atol=1e-15)
 
 
 @pytest.mark.parametrize(

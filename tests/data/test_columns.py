@@ -43,6 +43,31 @@ def test_a_mapping_wins_over_usual_names_and_can_leave_out():
     assert m.x.tolist() == [0.5, 1.5, 2.5, 3.5, 4.5, 5.5] and m.mag is None
 
 
+@pytest.mark.parametrize(
+    ("columns", "options", "reason"),
+    [
+        ({"sigma_u": "a", "sigma_v": "b"}, {"sigma": "by_magnitude"}, "sigma is 'by_magnitude'"),
+        ({"sigma_x": "a", "sigma_y": "b"}, {"sigma": 0.1}, "data.sigma is 0.1"),
+        ({"sigma_x": "a", "sigma_y": "b"}, {}, "column 'su' has the errors of u"),
+        ({"pm_ra": "a", "pm_dec": "b"}, {}, "the reference positions are u and v"),
+        ({"flux": "a"}, {}, "column 'mag' has magnitudes"),
+    ],
+)
+def test_named_columns_that_are_not_read_are_refused(columns, options, reason):
+    t = stars(mag=np.arange(6.0), a=np.ones(6), b=np.ones(6))
+    if "sigma" not in options:
+        t["su"] = t["sv"] = 0.1
+    with pytest.raises(InputError, match=f"column 'a' is named for .*{reason}"):
+        read(t, columns, **options)
+
+
+def test_an_epoch_of_the_catalogue_without_one_of_the_exposures_is_refused():
+    t = Table({"x": [1.0, 9], "y": [1.0, 9], "ra": [1.0, 1.001], "dec": [0.0, 0.001]})
+    t["pmra"], t["pmdec"] = [1.0, 2.0], [3.0, 4.0]
+    with pytest.raises(InputError, match="epoch of the exposures is not known"):
+        read(t, unit=None, sigma=0.1, catalogue_epoch=2016.0)
+
+
 def test_a_missing_column_is_answered_with_the_nearest():
     with pytest.raises(InputError, match=r"stars\.ecsv: column 'xcen' is missing; name 'x_cen'"):
         read(stars(x_cen=np.ones(6)), {"x": "xcen"})

@@ -98,6 +98,21 @@ def test_the_prior_may_be_given():
         read(t, epoch=EPOCH, motion_prior=-1.0)
 
 
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        ({"sigma": "by_magnitude", "epoch": EPOCH}, "data.sigma is 'by_magnitude'"),
+        ({"sigma": 0.01, "epoch": EPOCH}, "data.sigma is 0.01"),
+        ({"columns": {"sigma_ra": "", "sigma_dec": ""}, "epoch": EPOCH}, "read for 'sigma_ra'"),
+        ({"columns": {"pm_ra": "", "pm_dec": ""}, "epoch": EPOCH}, "read for 'pm_ra'"),
+        ({}, "epoch of the exposures is not known"),
+    ],
+)
+def test_a_prior_without_effect_is_refused(options, reason):
+    with pytest.raises(InputError, match=reason):
+        read(field(60)[0], motion_prior=5.0, **options)
+
+
 @pytest.mark.parametrize("name", ["pmra_error", "pmdec_error", "parallax_error"])
 def test_errors_below_zero_are_refused_by_row(name):
     t, _ = field()

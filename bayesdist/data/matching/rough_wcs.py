@@ -40,8 +40,8 @@ from bayesdist.data.matching.similarity import (
     grown_map,
     pattern_index,
 )
-from bayesdist.data.reading.centroids import with_variances
-from bayesdist.data.reading.columns import CENTROIDS
+from bayesdist.data.reading.centroids import check_ellipses, with_variances
+from bayesdist.data.reading.columns import CENTROIDS, present_columns
 from bayesdist.data.reading.motions import with_prior_motions
 from bayesdist.data.reading.options import ReadOptions
 from bayesdist.data.reading.table import (
@@ -273,7 +273,7 @@ def _table_of(data: Any, source: str) -> Table:
         data = read_table(Path(data))
     if isinstance(data, Matches):
         data = data.to_table()
-    table = with_variances(with_sky_columns(as_table(data, source)), source)
+    table = with_sky_columns(as_table(data, source))
     if not len(table):
         raise InputError("holds no rows", where=source, do="give a table with stars")
     return table
@@ -382,7 +382,8 @@ def _detections(
     detections: Any, columns: Mapping[str, str] | None, wcs: Any, options: ReadOptions
 ) -> _Seen:
     """Detections with rough positions from the WCS, or from columns of ra and dec."""
-    table = _table_of(detections, DETECTIONS)
+    original = _table_of(detections, DETECTIONS)
+    table = with_variances(original)
     if isinstance(detections, Matches) and detections.tangent_point is not None:
         _add_sky(table, detections)
     column_names = find_columns(
@@ -394,6 +395,8 @@ def _detections(
             where=DETECTIONS,
             do="give wcs, for example astropy.wcs.WCS(header)",
         )
+    if options.read_sigma and "sigma_u" not in column_names:
+        check_ellipses(original, column_names, DETECTIONS)
     rough = () if wcs is not None else ("ra", "dec")
     column_names = {
         k: name for k, name in column_names.items() if k in ("x", "y", *rough, *_FROM_DETECTIONS)
@@ -634,8 +637,12 @@ class _Found:
             table["epoch"] = rough_detections.epoch[index]
         unused = dict.fromkeys(ALIASES, "")
         unnamed = {name: name for name in table.colnames if name not in names.values()}
+        named = unused | unnamed | names
+        read = present_columns(
+            table.colnames, named, source=DETECTIONS, read_sigma=options.read_sigma
+        )
         settings = ReadOptions(
-            columns=unused | unnamed | names,
+            columns={key: name if key in read else "" for key, name in named.items()},
             sigma=options.sigma,
             pixel_origin=rough_detections.origin,
             tangent_point=point,

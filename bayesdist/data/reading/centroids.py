@@ -7,7 +7,7 @@ polynomial of the second order, fitted to the matches of each chip and exposure.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -70,39 +70,69 @@ def with_centroid_errors(quantities: Quantities, columns: Mapping[str, Any]) -> 
     return {**errors_of(total), "notes": (*columns.get("notes", ()), note)}
 
 
-def with_variances(table: Table, source: str) -> Table:
+def with_variances(table: Table) -> Table:
     """Table with variances and covariance of x and y where it has SExtractor's error ellipses.
 
     The first complete ellipse is used, of windowed, PSF or isophotal positions.  The table is
-    returned unchanged if it has none, or other errors of x and y.  Raises InputError by row if an
-    axis is not positive.
+    returned unchanged if it has none, or other errors of x and y.  `check_ellipses` refuses axes
+    that are not positive, if the errors are used.
     """
-    lower = {name.lower(): name for name in table.colnames}
+    names = ellipse_columns(table.colnames)
+    if names is None:
+        return table
+    axes, variances = names
+    a, b, angle = (np.ma.asarray(without_unit(table[name])) for name in axes)
+    cos, sin = np.ma.cos(np.radians(angle)), np.ma.sin(np.radians(angle))
+    made = (
+        a**2 * cos**2 + b**2 * sin**2,
+        a**2 * sin**2 + b**2 * cos**2,
+        (a**2 - b**2) * sin * cos,
+    )
+    out = table.copy(copy_data=False)
+    present = {name.lower() for name in table.colnames}
+    for name, values in zip(variances, made, strict=True):
+        if name not in present:
+            out[name] = MaskedColumn(values)
+    return out
+
+
+def ellipse_columns(
+    names: Iterable[str],
+) -> tuple[tuple[str, str, str], tuple[str, str, str]] | None:
+    """Columns of the first complete error ellipse, and names of its variances and covariance.
+
+    None if there is no ellipse, or if there are other errors of x and y.
+    """
+    lower = {name.lower(): name for name in names}
     for axes, variances in ELLIPSES:
         if not lower.keys() >= set(axes):
             continue
         others = {*ALIASES["sigma_x"], *ALIASES["sigma_y"], *ALIASES["rho_xy"]} - set(variances)
         if lower.keys() & others or variances[2] in lower:
-            return table
-        columns = [np.ma.asarray(without_unit(table[lower[name]])) for name in axes]
-        for name, values in zip(axes[:2], columns[:2], strict=True):
-            bad = np.ma.filled(values <= 0, fill_value=False)
-            if bad.any():
-                row = int(np.argmax(bad))
-                raise InputError(
-                    f"an axis of an error ellipse is {values[row]:g}",
-                    where=f"{source}, {row_number(row)}, column {lower[name]!r}",
-                    do="correct the row or drop it",
-                )
-        a2, b2 = columns[0] ** 2, columns[1] ** 2
-        cos, sin = np.ma.cos(np.radians(columns[2])), np.ma.sin(np.radians(columns[2]))
-        made = (a2 * cos**2 + b2 * sin**2, a2 * sin**2 + b2 * cos**2, (a2 - b2) * sin * cos)
-        out = table.copy(copy_data=False)
-        for name, values in zip(variances, made, strict=True):
-            if name not in lower:
-                out[name] = MaskedColumn(values)
-        return out
-    return table
+            return None
+        a, b, angle = (lower[name] for name in axes)
+        return (a, b, angle), variances
+    return None
+
+
+def check_ellipses(table: Table, found: Mapping[str, str], source: str) -> None:
+    """Raise InputError by row if an axis of an error ellipse that is used is not positive.
+
+    `table` is the one before `with_variances`, and `found` the columns by quantity after it.
+    """
+    names = ellipse_columns(table.colnames)
+    if names is None or found.get("sigma_x", "").lower() != names[1][0]:
+        return
+    for name in names[0][:2]:
+        values = np.ma.asarray(without_unit(table[name]))
+        bad = np.ma.filled(values <= 0, fill_value=False)
+        if bad.any():
+            row = int(np.argmax(bad))
+            raise InputError(
+                f"an axis of an error ellipse is {values[row]:g}",
+                where=f"{source}, {row_number(row)}, column {name!r}",
+                do="correct the row or drop it, or do not use these errors",
+            )
 
 
 def pixel_covariances(quantities: Quantities) -> Float:

@@ -12,7 +12,7 @@ import numpy as np
 from bayesdist.data.covariances import LARGEST_RHO
 from bayesdist.data.reading.centroids import with_centroid_errors
 from bayesdist.data.reading.options import ReadOptions
-from bayesdist.data.sky import SKY_QUANTITIES, onto_plane, reference_sky
+from bayesdist.data.sky import MOTIONS, SKY_QUANTITIES, onto_plane, reference_sky
 from bayesdist.data.tables.checks import refuse_half
 from bayesdist.data.tables.column import EncodedColumn, Quantities, SourceColumn, check_unit
 from bayesdist.data.tables.names import ALIASES, PAIRS, find_columns, origin_of
@@ -20,6 +20,7 @@ from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Float, Int
 
 CENTROIDS = ("sigma_x", "sigma_y", "rho_xy")  # errors of the centroids, in pixels
+ERRORS = ("sigma_u", "sigma_v", "rho_uv", "sigma_ra", "sigma_dec", *CENTROIDS)
 
 
 def position_unit(pair: tuple[SourceColumn, SourceColumn], unit: str | None) -> str:
@@ -158,6 +159,7 @@ def columns_read(
     """
     needed = needed_columns(names, options.columns, source=source, read_sigma=options.read_sigma)
     _refuse_unused(options, needed, source)
+    _refuse_unread(options, needed, source)
     notes: tuple[str, ...] = ()
     if options.pixel_origin is not None:
         return needed, options, notes
@@ -190,6 +192,59 @@ def _refuse_unused(options: ReadOptions, found: Mapping[str, str], source: str) 
             "same_position",
             do='leave {} out, or the column (columns = {{star = ""}})',
         )
+
+
+def _refuse_unread(options: ReadOptions, found: Mapping[str, str], source: str) -> None:
+    """Raise InputError for named columns, and a prior of motions, that would not be read."""
+    by_sigma = "" if options.read_sigma else f"data.sigma is {options.sigma!r}"
+    if options.motion_prior is not None:
+        lacking = [key for key in (*MOTIONS, "sigma_ra", "sigma_dec") if key not in found]
+        if by_sigma or lacking:
+            reason = by_sigma or f"no column is read for {lacking[0]!r}"
+            raise InputError(
+                f"a prior of motions adds to the errors of positions, and {reason}",
+                where=f"{source}, data.motion_prior",
+                do="leave it out, or read the errors of positions and motions from columns",
+            )
+    unread = [key for key, name in (options.columns or {}).items() if name and key not in found]
+    if not unread:
+        return
+    key = unread[0]
+    where = "on the sky" if "ra" in found else "u and v"
+    why = f"the reference positions are {where}"
+    if key == "flux" and "mag" in found:
+        why = f"column {found['mag']!r} has magnitudes"
+    elif key in ERRORS and by_sigma:
+        why = by_sigma
+    elif key in ERRORS and "sigma_u" in found:
+        why = f"column {found['sigma_u']!r} has the errors of u"
+    raise InputError(
+        f"column {(options.columns or {})[key]!r} is named for {key!r}, which is not read: {why}",
+        where=f"{source}, columns",
+        do=f"leave {key!r} out",
+    )
+
+
+def are_moved(options: ReadOptions, found: Mapping[str, str], source: str) -> bool:
+    """True if positions are moved from the epoch of the catalogue to that of the exposures.
+
+    `found` are the columns by quantity.  Raises InputError if an option of these motions is given
+    and one of the epochs is not known.
+    """
+    if "pm_ra" not in found:
+        return False
+    lacking = "" if options.epoch is not None or "epoch" in found else "exposures"
+    if options.catalogue_epoch is None and "catalogue_epoch" not in found:
+        lacking = "catalogue"
+    if lacking:
+        options.refuse(
+            source,
+            f"no motions are applied, since the epoch of the {lacking} is not known",
+            *("catalogue_epoch", "motion_prior"),
+            do="leave {} out, or give "
+            + ("data.epoch" if lacking == "exposures" else "data.catalogue_epoch"),
+        )
+    return not lacking
 
 
 def match_columns(quantities: Quantities, options: ReadOptions) -> dict[str, Any]:

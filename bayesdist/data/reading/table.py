@@ -15,8 +15,8 @@ from astropy.table import Column, MaskedColumn, QTable, Table
 from astropy.time import Time
 
 from bayesdist.data.output import header_arguments
-from bayesdist.data.reading.centroids import with_variances
-from bayesdist.data.reading.columns import columns_read, is_on_sky, match_columns
+from bayesdist.data.reading.centroids import check_ellipses, with_variances
+from bayesdist.data.reading.columns import are_moved, columns_read, is_on_sky, match_columns
 from bayesdist.data.reading.motions import with_prior_motions
 from bayesdist.data.reading.options import ReadOptions
 from bayesdist.data.repeated import star_codes
@@ -252,8 +252,10 @@ def match_arguments(
         units are missing or contradictory, or if there are no rows.
     """
     options = options or ReadOptions()
-    table = with_variances(with_sky_columns(as_table(data, source)), source)
+    original = with_sky_columns(as_table(data, source))
+    table = with_variances(original)
     column_names, options, notes = columns_read(table.colnames, table.meta, options, source=source)
+    check_ellipses(original, column_names, source)
     if len(table) == 0:
         raise InputError("holds no rows", where=source, do="give a table with matched stars")
     if options.plate_scale is not None:
@@ -261,10 +263,7 @@ def match_arguments(
         options, notes = replace(options, unit="arcsec", plate_scale=None), (*notes, scaled)
     if options.epoch is None and "pm_ra" in column_names and "epoch" not in column_names:
         options = replace(options, epoch=own_epoch(table.meta))
-    dated = "catalogue_epoch" in column_names or options.catalogue_epoch is not None
-    moves = (
-        "pm_ra" in column_names and dated and ("epoch" in column_names or options.epoch is not None)
-    )
+    moves = are_moved(options, column_names, source)
     if moves:
         filled = with_prior_motions(
             table,
