@@ -187,6 +187,43 @@ def test_an_offset_and_a_smooth_field_are_aligned_as_least_squares_does(pixels):
 PAIRS = [(i, j) for i in range(80) for j in range(i)]
 
 
+@pytest.mark.parametrize("lengths", [0.01, 1.0, 3.0, 10.0, 30.0, 100.0])
+def test_differences_follow_the_covariance_in_fields_of_any_width(pixels, lengths):
+    """Mean squares of differences, in the mean over the field, against 2 (V(0) - V(theta))."""
+    scale = 100.0
+    width = SIZE[0] * scale / 3.6e6  # degrees
+    own = {"systematics_mas": 3.0, "correlation_deg": width / lengths}
+    draws = drawn(pixels(), Catalogue("A", **own), scale=scale)
+    rng = np.random.default_rng(6)
+    x, y = (rng.uniform(1, m, 250) for m in SIZE)
+    model = draws.solution.model
+    domain = EvaluationDomain(model, np.ones(250, int), x, y, relative="pairs")
+    square = sum(f.total() for f in draws.at(domain) if f.rows and " A" in f.rows[0].name)
+    first, second = domain.pairs()
+    apart = np.hypot(x[first] - x[second], y[first] - y[second]) / SIZE[0]  # in widths
+    expected = 2.0 * (3.0 / scale) ** 2 * -np.expm1(-apart * lengths)
+    for low, high in ((0.003, 0.02), (0.02, 0.06), (0.06, 0.2), (0.2, 0.6)):
+        rows = (apart > low) & (apart < high)
+        ratio = np.sqrt(square[rows].mean() / expected[rows].mean())
+        assert ratio == pytest.approx(1.0, abs=0.12 if low < 0.01 else 0.06), (low, high)
+
+
+@pytest.mark.parametrize("degrees", [1e12, 1e3, 1e-12, 1e-300])
+def test_correlation_lengths_far_from_the_field_are_limits(pixels, degrees):
+    """An offset of the whole field, or independent errors."""
+    catalogue = Catalogue("A", systematics_mas=3.0, correlation_deg=degrees)
+    fields = fields_at(drawn(pixels(), catalogue), [1.0, 1500.0], [1.0, 900.0])
+    names = [name for name in fields.parts if name.startswith("reference catalogue A")]
+    errors = summed(fields, names)
+    np.testing.assert_allclose(
+        sum(np.square(fields.sigma(name)) for name in names), 9.0 / 50.0**2, rtol=1e-6
+    )
+    difference = np.std(errors[:, 1] - errors[:, 0]) / (3.0 / 50.0)
+    separation = np.hypot(1499.0, 899.0) * 50.0 / 3.6e6
+    expected = np.sqrt(2.0 * -np.expm1(-separation / degrees))
+    assert difference == pytest.approx(expected, rel=0.15, abs=1e-6)
+
+
 @pytest.mark.parametrize("scale", [50.0, 500.0])
 def test_mean_squares_are_exact_at_positions_and_for_differences(pixels, scale):
     solution = pixels()

@@ -20,7 +20,12 @@ from bayesdist.utils.arrays import Float
 
 NODES = 12  # along u and v of the field, between which the field of errors is interpolated
 MODES = 40  # functions that represent the field beyond its constant and tilt
-WAVES = 12  # waves, each a sine and a cosine, that represent its structure finer than these
+# waves, each a sine and a cosine, that represent finer structure: at least 12, and as many as their
+# fraction of the variance times 100
+MIN_WAVES, MAX_WAVES = 12, 100
+# scales in units of the diameter of the field: those outside are an error common to the field, or
+# errors that are independent at any two positions
+SCALES = (1e-9, 1e6)
 GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))  # directions of waves that are spread evenly
 
 
@@ -55,6 +60,36 @@ class AngularCovariance:
         """Standard deviation of one error on one axis, in mas."""
         return math.sqrt(sum(variance for variance, _ in self.parts))
 
+    def of_field(self, diameter: float) -> tuple[float, AngularCovariance]:
+        """Variance that is common to a field, and the covariance that varies over it.
+
+        `diameter` of the field in degrees.
+        """
+        shortest, longest = (factor * diameter for factor in SCALES)
+        common = sum(variance for variance, scale in self.parts if scale > longest)
+        varying = tuple((v, max(s, shortest)) for v, s in self.parts if s <= longest)
+        return common, AngularCovariance(varying)
+
+    def beyond(self, wavenumber: ArrayLike) -> Float:
+        """Variance in structure with larger wavenumbers, in radians per degree, of any shape.
+
+        In the plane exp(-theta / s) has the spectrum s^2 / (1 + k^2 s^2)^(3/2).
+        """
+        k = np.asarray(wavenumber, float)
+        out = np.zeros(k.shape)
+        for variance, scale in self.parts:
+            out += variance / np.hypot(1.0, k * scale)
+        return out
+
+    def wavenumbers(self, smallest: float, n: int) -> Float:
+        """Wavenumbers (n,) beyond the smallest that have equal parts of the variance beyond it."""
+        quantiles = (np.arange(n) + 0.5) / n * self.beyond(smallest)
+        # `beyond` is at most the sum of v / (k s)
+        largest = 4.0 * n * sum(v / s for v, s in self.parts) / float(self.beyond(smallest))
+        k = np.geomspace(smallest, max(largest, 2.0 * smallest), 4000)
+        return np.exp(np.interp(np.log(quantiles[::-1]), np.log(self.beyond(k))[::-1],
+                                np.log(k)[::-1])[::-1])  # fmt: skip
+
 
 class SplitField:
     """Gaussian field of errors on one axis, split into a constant and tilt, and the rest.
@@ -76,22 +111,37 @@ class SplitField:
         side = np.linspace(-1.0, 1.0, NODES)
         unit_nodes = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
         self._nodes = self._centre + self._half * unit_nodes
-        K = mas**2 * covariance(cdist(self._nodes, self._nodes))
+        common, self._varying = covariance.of_field(2.0 * float(np.hypot(*self._half)))
+        self._tilt = np.diag([mas * math.sqrt(common), 0.0, 0.0])
+        if self._varying.parts:
+            self._divide(common)
+
+    def _divide(self, common: float) -> None:
+        """Prepare the constant and tilt, the functions and the waves; `common` in mas^2."""
+        K = self._mas**2 * self._varying(cdist(self._nodes, self._nodes))
         self._factor = cho_factor(K)
         B = self._plane(self._nodes)
         S = np.linalg.inv(B.T @ cho_solve(self._factor, B))
-        self._tilt = np.linalg.cholesky((S + S.T) / 2.0)
-        root = B @ self._tilt
+        S = (S + S.T) / 2.0
+        root = B @ np.linalg.cholesky(S)
+        S[0, 0] += self._mas**2 * common
+        self._tilt = np.linalg.cholesky(S)
         values, vectors = np.linalg.eigh(K - root @ root.T)
         largest = np.argsort(values)[::-1][:MODES]
         self._modes = cho_solve(
             self._factor, vectors[:, largest] * np.sqrt(np.maximum(values[largest], 0.0))
         )
-        # the spectrum of exp(-theta / s) falls as k^-3 in the plane, so that 1 / k is uniform
-        index = np.arange(WAVES)
-        k = np.pi * math.sqrt(MODES) / (2.0 * self._half.mean()) / ((index + 0.5) / WAVES)
-        angle = GOLDEN_ANGLE * index
+        smallest = np.pi * math.sqrt(MODES) / (2.0 * self._half.mean())
+        share = float(self._varying.beyond(smallest)) / self._varying.sigma**2
+        n = max(MIN_WAVES, math.ceil(MAX_WAVES * share))
+        angle = GOLDEN_ANGLE * np.arange(n)
+        k = self._varying.wavenumbers(smallest, n)
         self._waves = k * np.stack([np.cos(angle), np.sin(angle)])
+
+    @property
+    def n_rest(self) -> int:
+        """Number of functions of the rest, of value 0 if the errors are common to the field."""
+        return MODES + 2 * self._waves.shape[1] if self._varying.parts else 1
 
     def _sky(self, chip: int, x: Float, y: Float) -> Float:
         """Positions (N, 2) on the sky in degrees, of pixels (N,) on a chip."""
@@ -110,14 +160,16 @@ class SplitField:
 
     def rest(self, chip: int, x: Float, y: Float) -> Float:
         """Values (N, m) of functions whose coefficients have unit variance: the rest."""
+        if not self._varying.parts:
+            return np.zeros((len(x), 1))
         sky = self._sky(chip, x, y)
-        phi = self._mas**2 * self.covariance(cdist(sky, self._nodes)) @ self._modes
+        phi = self._mas**2 * self._varying(cdist(sky, self._nodes)) @ self._modes
         common = np.square(self._plane(sky) @ self._tilt).sum(axis=1)
         variance = np.maximum((self._mas * self.covariance.sigma) ** 2 - common, 0.0)
         size = np.square(phi).sum(axis=1)
         # rounding may leave more in the functions than there is
         phi *= np.sqrt(np.minimum(variance / np.where(size > 0, size, 1.0), 1.0))[:, None]
-        fine = np.sqrt(np.maximum(variance - size, 0.0) / WAVES)[:, None]
+        fine = np.sqrt(np.maximum(variance - size, 0.0) / self._waves.shape[1])[:, None]
         phase = sky @ self._waves
         return np.hstack([phi, fine * np.cos(phase), fine * np.sin(phase)])
 
@@ -140,7 +192,7 @@ class SkyTerm:
     def draw(self, n: int, rng: np.random.Generator) -> Functions | GrowingFunctions:
         """Draws of independent coefficients for u and v."""
         functions = self.split.tilt if self.is_tilt else self.split.rest
-        n_own, m = min(n, SMOOTH_DRAWS), 3 if self.is_tilt else MODES + 2 * WAVES
+        n_own, m = min(n, SMOOTH_DRAWS), 3 if self.is_tilt else self.split.n_rest
         out = Functions(
             self.row,
             {None: rng.standard_normal((n_own, 2, m))},
