@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bayesdist.assess.solution import place_of
 from bayesdist.model import DistortionModel
@@ -80,7 +81,9 @@ class Alignment:
         rigid = self.rigid[:, self.model.chip_code(chip)]
         return np.asarray(np.moveaxis(rigid @ phi.T, 2, 0).swapaxes(1, 2))
 
-    def fitted(self, chip: int, functions: Callable[[int, Float, Float], Float]) -> Float:
+    def fitted(
+        self, chip: int, functions: Callable[[int, Float, Float], NDArray[np.floating]]
+    ) -> Float:
         """Shifts and rotation (3, 2, m) fitted to each function on a chip, as an error of u or v.
 
         `functions(chip, x, y)` returns values (N, m) at pixels. The shifts and rotation fitted to

@@ -497,10 +497,14 @@ class FunctionField(DrawnField):
     def _absorbed(self) -> Float:
         """Shifts and rotation (n', 3) fitted to the errors of each row of coefficients."""
         by_chip = [
-            np.einsum("nam,pam->np", self.of.of(chip), fit) for chip, fit in self._fits.items()
+            np.tensordot(required(self.of.of(chip), "the chip has errors"), fit, ((1, 2), (1, 2)))
+            for chip, fit in self._fits.items()
         ]
         every = slice(0, max((len(fitted) for fitted in by_chip), default=1))
-        return sum((_of_draws(fitted, every) for fitted in by_chip), np.zeros((1, 3)))
+        total = np.zeros((1, 3))
+        for fitted in by_chip:
+            total = total + _of_draws(fitted, every)
+        return total
 
     @cached_property
     def _rigid(self) -> Float:
