@@ -43,6 +43,7 @@ from bayesdist.data.matches import Matches
 from bayesdist.data.output import geometry_header, header_arguments
 from bayesdist.data.reading.centroids import ellipse_columns
 from bayesdist.data.reading.columns import (
+    are_moved,
     columns_read,
     match_columns,
     nominal_columns,
@@ -390,6 +391,7 @@ def stored_file(
     """
     source = part.name
     column_names, options, notes = columns_read(part.colnames, {}, options, source=source)
+    are_moved(options, column_names, source)  # refuses options that would have no effect
     ellipse = ellipse_columns(part.colnames)
     if options.read_sigma and "sigma_u" not in column_names and ellipse is not None:
         raise InputError(

@@ -101,8 +101,7 @@ def test_the_prior_may_be_given():
 @pytest.mark.parametrize(
     ("options", "reason"),
     [
-        ({"sigma": "by_magnitude", "epoch": EPOCH}, "data.sigma is 'by_magnitude'"),
-        ({"sigma": 0.01, "epoch": EPOCH}, "data.sigma is 0.01"),
+        ({"sigma": 0.01, "epoch": EPOCH}, "sigma is 0.01"),
         ({"columns": {"sigma_ra": "", "sigma_dec": ""}, "epoch": EPOCH}, "read for 'sigma_ra'"),
         ({"columns": {"pm_ra": "", "pm_dec": ""}, "epoch": EPOCH}, "read for 'pm_ra'"),
         ({}, "epoch of the exposures is not known"),

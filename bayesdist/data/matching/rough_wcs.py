@@ -359,6 +359,12 @@ def _reference(
             table, column_names, source=CATALOGUE, sigma_mas_yr=options.motion_prior, reject=True
         )
         table, of_motions = filled.table, filled.notes
+    elif options.motion_prior is not None:
+        raise InputError(
+            "motion_prior is given, but no errors of matches include those of motions",
+            where="match",
+            do="leave it out, or read motions, and errors from columns of the catalogue",
+        )
     read = {key: name for key, name in column_names.items() if key in ("ra", "dec", *MOTIONS)}
     stay, counts = without_missing(
         table,

@@ -199,10 +199,10 @@ def _refuse_unread(options: ReadOptions, found: Mapping[str, str], source: str) 
     by_sigma = "" if options.read_sigma else f"data.sigma is {options.sigma!r}"
     if options.motion_prior is not None:
         lacking = [key for key in (*MOTIONS, "sigma_ra", "sigma_dec") if key not in found]
-        if by_sigma or lacking:
-            reason = by_sigma or f"no column is read for {lacking[0]!r}"
+        if lacking:
             raise InputError(
-                f"a prior of motions adds to the errors of positions, and {reason}",
+                "motion_prior is given, and errors of positions do not grow with it: no column is "
+                f"read for {lacking[0]!r}",
                 where=f"{source}, data.motion_prior",
                 do="leave it out, or read the errors of positions and motions from columns",
             )
