@@ -126,7 +126,7 @@ def test_solutions_of_other_types(stars, kind):
         assert text.startswith(f"{function.__name__}: solution is a")
         assert text.endswith("give a Posterior or LinearFit.")
     assert "give a Posterior" in refusal(bd.Calibration.from_solution, solution=wrong)
-    assert "no requirement" in refusal(bd.check_requirements, solution=fit, requirements=wrong)
+    assert "not a requirement" in refusal(bd.check_requirements, solution=fit, requirements=wrong)
     assert "catalog is a" in refusal(bd.match_table, table=stars, catalog=wrong)
 
 

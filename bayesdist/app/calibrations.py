@@ -101,9 +101,9 @@ def calibration_at(
     if size is not None and tuple(map(float, size)) not in sizes:
         stated = " and ".join(dict.fromkeys(f"{nx:g} x {ny:g}" for nx, ny in sizes))
         raise InputError(
-            f"states a size of {stated} pixels, and {size[0]:g} x {size[1]:g} are given",
+            f"states a size of {stated} pixels, but {size[0]:g} x {size[1]:g} are given",
             where=str(path),
-            do="leave the size (--size on the command line) out",
+            do="leave out the size (--size on the command line)",
         )
     return calibration
 
@@ -192,7 +192,7 @@ def refuse_unused_date(epoch: float | None, *calibrations: Calibration) -> None:
     raise InputError(
         "does not depend on time",
         where=" and ".join(dict.fromkeys(calibration.name for calibration in calibrations)),
-        do="leave the date (--epoch on the command line) out",
+        do="leave out the date (--epoch on the command line)",
     )
 
 
@@ -224,11 +224,10 @@ def solution_at(path: Path) -> Solution | None:
     """
     if path.is_dir():
         if not (path / "run.json").exists() and not (path / "posterior.nc").exists():
-            raise InputError("is a folder, and no run", where=str(path), do="give a file in it")
+            raise InputError("is a folder, but not a run", where=str(path), do="give a file in it")
         if not (path / "run.json").exists():
             raise InputError(
-                "has no run.json, without which the errors that the run was assessed with are not "
-                "known",
+                "has no run.json, so the errors with which the run was assessed are unknown",
                 where=str(path),
                 do=f"restore it, or give {path / 'posterior.nc'}, the bare posterior",
             )

@@ -74,7 +74,9 @@ EXAMPLES = {
 
 def _renamed(name: str, new: str) -> RenamedError:
     """Error for a command that has been renamed."""
-    return RenamedError(f"the command {name!r} is {new!r} now", do=f"say 'bayesdist {new}'")
+    return RenamedError(
+        f"the command {name!r} has been renamed to {new!r}", do=f"use 'bayesdist {new}'"
+    )
 
 
 def _commands_of_plugins() -> dict[str, str]:

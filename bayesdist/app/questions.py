@@ -274,7 +274,9 @@ def _pairs(positions: Positions, name: str) -> list[tuple[float, float]]:
         pairs = np.zeros((0, 0))
     if pairs.ndim != 2 or pairs.shape[1] != 2:
         raise InputError(
-            f"{name} is {positions!r}", where="budget", do="give (x, y), or a list of such pairs"
+            f"{name} is {positions!r}, which is not a position",
+            where="budget",
+            do="give (x, y), or a list of such pairs",
         )
     return [(float(x), float(y)) for x, y in pairs]
 

@@ -92,7 +92,7 @@ def _of_any_star(requirement: Requirement, *, has_mag: bool) -> Requirement:
     """Requirement without its magnitude; refused if it has one and the matches have none."""
     if requirement.magnitude is not None and not has_mag:
         raise InputError(
-            f"names magnitude {requirement.magnitude:g}, and the matches have no magnitudes",
+            f"names magnitude {requirement.magnitude:g}, but the matches have no magnitudes",
             where=requirement.where,
             do="name their column in [data.columns], or leave magnitude out",
         )

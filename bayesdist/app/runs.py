@@ -45,7 +45,7 @@ def open_run(folder: str | os.PathLike[str]) -> Run:
     directory = RunDirectory(Path(folder))
     if not directory.is_initialized:
         raise InputError(
-            "is no run: it has no run.json",
+            "is not a run: it has no run.json",
             where=str(folder),
             do="restore it, or make the run again with bayesdist.run",
         )

@@ -204,7 +204,7 @@ def continue_stage(
     begins_with = directory.config.begins_with
     if stage == "match" != begins_with:
         raise InputError(
-            "has no star lists to match", where=str(path), do="begin with the stage 'fit'"
+            "has no star lists to match", where=str(path), do="start with the stage 'fit'"
         )
     stages = ASSESS if stage == "assess" else (stage,)
     needs = (begins_with,) if stage == "fit" != begins_with else NEEDS[stages[0]]

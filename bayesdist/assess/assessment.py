@@ -392,9 +392,9 @@ def _posterior_of(solution: Solution, diagnostics: Diagnostics) -> Posterior:
         )
     if not isinstance(solution, Posterior):
         raise InputError(
-            f"they are those of a posterior, and the solution is a {type(solution).__name__}",
+            f"they are those of a posterior, but the solution is a {type(solution).__name__}",
             where=location,
-            do="give the posterior, or leave them out",
+            do="give the posterior, or leave out the diagnostics",
         )
     if solution.own_places or solution.model.gauge == "held":
         kind = "self-calibration" if solution.own_places else "campaign"

@@ -135,7 +135,10 @@ def _ends(
     if model.time is None:
         return ((),)
     if years is None or not years[0] < years[1]:
-        raise InputError(f"the years are {years}", do="give a first and a later last one")
+        raise InputError(
+            f"the years are {years}, which are not ascending",
+            do="give the first and then the last year",
+        )
     first, last = years
     edges = [first, *(b for b in model.time.breaks if first < b < last), last]
     out = []

@@ -194,7 +194,7 @@ class EvaluationDomain:
                     do="give FITS 1-based pixels",
                 )
         if relative and x.size < 2:
-            raise InputError("a relative error is of two positions", do="give a second one")
+            raise InputError("a relative error needs two positions", do="give a second one")
         return cls(
             model,
             np.full(x.size, chip, np.int64),

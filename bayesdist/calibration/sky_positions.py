@@ -386,7 +386,7 @@ def sky_distribution(
     n_draws = whole_number(n_draws, "n_draws", least=2)
     if calibration.errors == "none" and not calibration.further and centroids is None:
         raise InputError(
-            "has no errors that could be drawn",
+            "has no errors to draw",
             where=calibration.name,
             do="give a calibration with a covariance, or the errors of the centroids",
         )

@@ -307,7 +307,7 @@ class CalibrationWCS(BaseLowLevelWCS, HighLevelWCSMixin):
         n = whole_number(n, "the number of draws", least=0, where="draw")
         if self.calibration.errors == "none":
             raise InputError(
-                "has no errors of the coefficients that could be drawn",
+                "has no coefficient errors to draw",
                 where=self.calibration.name,
                 do="use a run, or a file that contains the covariance",
             )

@@ -25,5 +25,5 @@ def every_kth(n_rows: int, n: int) -> int:
     Raises InputError if n is less than one.
     """
     if n < 1:
-        raise InputError(f"a sample of {n} rows is asked for", do="ask for at least one")
+        raise InputError(f"a sample of {n} rows is requested", do="ask for at least one")
     return max(1, -(-n_rows // n))

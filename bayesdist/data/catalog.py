@@ -136,7 +136,7 @@ class ReferenceCatalog:
             raise InputError(
                 f"codes of the stars are not {n} numbers of 0 or more",
                 where=f"{self.source}, column 'star'",
-                do="number the stars, or leave the column out",
+                do="number the stars, or leave out the column",
             )
         if self.epoch is not None and np.ndim(self.epoch):
             object.__setattr__(self, "epoch", np.ascontiguousarray(self.epoch, np.float64))
@@ -524,7 +524,7 @@ def catalog_from_table(
         raise InputError(
             f"no columns for u, v or ra, dec among {', '.join(table.colnames) or 'none'}",
             where=source,
-            do="rename the columns, or name them in the option 'columns'",
+            do="rename the columns, or name them with the option 'columns'",
         )
     unread = _unread(column_names, on_sky=on_sky)
     column_names = {key: name for key, name in column_names.items() if key not in unread}
@@ -545,7 +545,7 @@ def catalog_from_table(
             raise InputError(
                 "has no unit",
                 where=column(key).where,
-                do="write mas or mas / yr into the file, or leave the column out by an empty name "
+                do="write mas or mas / yr into the file, or leave out the column by an empty name "
                 "in the option 'columns'",
             )
         numbers = column(key).numbers_or(0.0) if key in _SPARED else column(key).numbers()
@@ -656,7 +656,7 @@ def _of_positions(column: SourceColumn) -> Float:
     beyond = np.abs(rho) > 1.0
     if beyond.any():
         bad = int(np.argmax(beyond))
-        raise column.fail(bad, f"a correlation is {rho[bad]:g}, and is 1 at most")
+        raise column.fail(bad, f"a correlation is {rho[bad]:g}, but must be at most 1")
     out = np.tile(np.eye(len(_SIGMAS)), (len(rho), 1, 1))
     out[:, 0, 1] = out[:, 1, 0] = rho
     return out
@@ -668,5 +668,5 @@ def _identities(column: SourceColumn) -> Int:
     unique, first = np.unique(star, return_index=True)
     if len(unique) < len(star):
         repeated = int(np.setdiff1d(np.arange(len(star)), first)[0])
-        raise column.fail(repeated, f"star {star[repeated]} stands twice")
+        raise column.fail(repeated, f"star {star[repeated]} occurs twice")
     return star

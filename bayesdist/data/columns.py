@@ -230,7 +230,7 @@ class _Column:
             return matches.__dict__[self._name]
         except KeyError:
             raise InputError(
-                f"the stars are on disk, and no column {self._name!r} of them is in memory",
+                f"the stars are on disk, so their column {self._name!r} is not in memory",
                 where=", ".join(matches.sources),
                 do="go through batches(), or take sample(n) or load()",
             ) from None
@@ -319,7 +319,7 @@ def _check(
             raise InputError(
                 f"correlations of errors must lie between -{LARGEST_RHO} and {LARGEST_RHO}"
                 if beyond.any()
-                else "correlations of errors are given, and the errors are not",
+                else "correlations of errors are given without the errors",
                 where=place(int(np.argmax(beyond)), CORRELATION),
                 do="correct them, or leave the column out",
             )
@@ -330,7 +330,7 @@ def _check(
         if columns[name].min() < 0 or columns[name].max() >= len(names):
             label = {**LABELS_OF_CODES, "source": "sources"}[name]
             raise InputError(
-                f"codes in {name!r} point outside {label!r}",
+                f"codes in {name!r} are not indices of {label!r}",
                 where=where,
                 do="give a label for each code",
             )
@@ -338,7 +338,7 @@ def _check(
     if star is not None and star.min() < 0:
         bad = int(np.argmax(star < 0))
         raise InputError(
-            f"value is {star[bad]}, and must not be negative",
+            f"value is {star[bad]}, but must not be negative",
             where=place(bad, "star"),
             do="number the reference stars from 0",
         )
@@ -475,7 +475,7 @@ def merged_optional(
         lacking = next(s for a, s in zip(arrays, sources, strict=True) if a is None)
         having = next(s for a, s in zip(arrays, sources, strict=True) if a is not None)
         raise InputError(
-            f"has no {name!r}, but {having} has",
+            f"has no {name!r}, but {having} does",
             where=lacking,
             do="give the column in all files or in none",
         )

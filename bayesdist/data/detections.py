@@ -170,7 +170,7 @@ def detections_of(
     with_mag = [stars.mag is not None for stars in lists]
     if any(with_mag) and not all(with_mag):
         bare = lists[with_mag.index(False)]
-        raise InputError("has no magnitudes, and others have", where=bare.source)
+        raise InputError("has no magnitudes, although other lists do", where=bare.source)
     n = [len(stars) for stars in lists]
     errors: dict[str, Any] = {}
     if sigma is not None:

@@ -92,7 +92,7 @@ class Exposure:
             value = getattr(self, key)
             if value is not None and not np.isfinite(value):
                 raise InputError(
-                    f"{key} is {value}, and must be finite",
+                    f"{key} is {value}, but must be finite",
                     where=f"exposure {self.name}",
                     do="correct it or leave it out",
                 )
@@ -103,13 +103,13 @@ class Exposure:
             ):
                 low, high = _RANGES[key]
                 raise InputError(
-                    f"{key} is {value:g}, and must be between {low:g} and {high:g}",
+                    f"{key} is {value:g}, but must be between {low:g} and {high:g}",
                     where=f"exposure {self.name}",
                     do=f"give it in {_UNITS[key]}, or leave it out",
                 )
         if self.vafactor is not None and abs(self.vafactor - 1.0) > _SLOWEST:
             raise InputError(
-                f"vafactor is {self.vafactor}, and lies within {_SLOWEST:g} of 1 for every orbit",
+                f"vafactor is {self.vafactor}, but must be within {_SLOWEST:g} of 1 for any orbit",
                 where=f"exposure {self.name}",
                 do="give the factor of velocity aberration of the science header",
             )
@@ -143,7 +143,7 @@ class ExposureLog:
         if len(self._by_name) < len(names):
             repeated = next(name for k, name in enumerate(names) if name in names[:k])
             raise InputError(
-                f"exposure {repeated} stands twice", where=self.source, do="name each only once"
+                f"exposure {repeated} occurs twice", where=self.source, do="name each only once"
             )
 
     @cached_property
@@ -397,7 +397,7 @@ def write_exposures(log: ExposureLog, path: str | os.PathLike[str]) -> None:
     path = Path(path)
     if path.suffix.lower() not in _FORMATS:
         raise InputError(
-            f"extension {path.suffix!r} is not one of a log",
+            f"extension {path.suffix!r} is not known for exposure logs",
             where=str(path),
             do=f"choose one of {', '.join(_FORMATS)}",
         )
@@ -406,7 +406,7 @@ def write_exposures(log: ExposureLog, path: str | os.PathLike[str]) -> None:
     # star lists are found by these names
     if path.suffix.lower() == ".fits" and not_ascii is not None:
         raise InputError(
-            f"the name {not_ascii!r} is not ASCII, which FITS tables hold alone",
+            f"the name {not_ascii!r} is not ASCII, as FITS tables require",
             where=str(path),
             do="write .ecsv or .csv",
         )

@@ -86,7 +86,7 @@ class MagnitudeErrors:
 def no_magnitudes(where: str) -> InputError:
     """Error for stars without magnitudes when errors are to be estimated by magnitude."""
     return InputError(
-        "holds no magnitudes, and errors by magnitude need them",
+        "holds no magnitudes, which errors by magnitude require",
         where=where,
         do="name the column mag, or give errors as columns or as a number",
     )
@@ -121,7 +121,7 @@ def estimate(
         )
     if 2 * mag.size <= n_params:
         raise InputError(
-            f"{mag.size} stars leave no residuals beside {n_params} parameters",
+            f"{mag.size} stars are too few to leave residuals after fitting {n_params} parameters",
             where=source,
             do="lower the order of the model or give errors",
         )

@@ -173,7 +173,7 @@ class Matches(MatchColumns):
         }
         values = defaults | {"rejected": {}} | columns
         if values.keys() != {argument.name for argument in arguments}:
-            raise TypeError(f"{', '.join(columns)} are not the columns of matches")
+            raise TypeError(f"{', '.join(columns)} are not columns of Matches")
         matches = object.__new__(cls)
         for name, value in values.items():
             object.__setattr__(matches, name, value)
@@ -614,7 +614,7 @@ class Matches(MatchColumns):
     ) -> Matches:
         if which.dtype != bool or which.shape != (len(self),):
             raise InputError(
-                "stars on disk are selected by a mask of all of them",
+                "stars on disk can only be selected by a mask of all of them",
                 where=", ".join(self.sources),
                 do="give a mask, or load() them",
             )
@@ -976,12 +976,12 @@ def _checked_numbers(
         sigma = values_in(error, unit, name)
         if sigma.ndim:
             raise InputError(
-                "errors of single stars are given, and the stars are on disk",
+                "errors of individual stars cannot be given for stars on disk",
                 do="write them into the files, or load() the stars",
             )
         if not (np.isfinite(sigma) and sigma > 0):
             raise InputError(
-                f"{name} is {sigma:g}, and must be finite and positive", do="give another"
+                f"{name} is {sigma:g}, but must be finite and positive", do="give another"
             )
         numbers.append(float(sigma))
     return numbers[0], numbers[1]

@@ -77,7 +77,7 @@ def motion_error_line(catalog: ReferenceCatalog) -> MotionErrorLine:
     sigma = _motion_errors(catalog)
     if catalog.mag is None:
         raise InputError(
-            "has no magnitudes to tell badly measured motions by",
+            "has no magnitudes, which are needed to recognise poorly measured motions",
             where=catalog.source,
             do="give them, or keep all stars (campaign.pm_selection = 'all')",
         )
@@ -240,9 +240,9 @@ def exposures_drawn(names: Sequence[str], n: int, seed: int) -> tuple[str, ...]:
     """
     if n >= len(names):
         raise InputError(
-            f"{n} exposures are to be held out, and there are {len(names)}",
+            f"{n} exposures are to be held out, but there are only {len(names)}",
             where="holdout.exposures",
-            do="ask for fewer",
+            do="hold out fewer",
         )
     drawn = sorted(names, key=lambda name: hashlib.sha256(f"{seed}\n{name}".encode()).digest())
     chosen = set(drawn[:n])
@@ -286,7 +286,9 @@ def _refuse_nothing(held: int, n: int, where: str) -> None:
     if 0 < held < n:
         return
     raise InputError(
-        "no star is set aside" if held == 0 else "every star is set aside, and none is left to fit",
+        "no star is held out"
+        if held == 0
+        else "every star is held out, so that none is left to fit",
         where=where,
         do="correct holdout.fraction and holdout.exposures",
     )

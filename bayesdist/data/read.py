@@ -94,7 +94,7 @@ def read_matches(
     if is_table(path):
         if format not in ("auto", "table"):
             raise InputError(
-                f"format is {format!r}, but a table is given, no file",
+                f"format is {format!r}, but a table is given instead of a file",
                 where="format",
                 do="leave it out",
             )
@@ -267,8 +267,8 @@ def _read_with_master(
         (masters if is_master else lists).append(file)
     if len(masters) != 1 or not lists:
         raise InputError(
-            f"{len(masters)} masters of the format {key!r} and {len(lists)} lists are named: a "
-            "master alone has no detector positions",
+            f"{len(masters)} masters of the format {key!r} and {len(lists)} lists are named, but "
+            "a master alone has no detector positions",
             where=", ".join(str(file) for file in files),
             do=f"name one master together with the {format_.lists} lists to match with it",
         )

@@ -110,7 +110,7 @@ def _sexagesimal(column: SourceColumn, texts: NDArray[np.str_], key: str) -> Flo
             try:
                 Angle(text, unit=unit)
             except (ValueError, TypeError, apu.UnitsError):
-                raise column.fail(index, f"{text[:40]!r} stands where an angle must be") from None
+                raise column.fail(index, f"{text[:40]!r} is not an angle") from None
         raise
 
 
@@ -203,7 +203,7 @@ def _in_unit(column: SourceColumn, key: str, unit: str, *, missing: bool) -> Flo
     if column.unit is None and unit:
         # catalogues use degrees for positions and mas for other columns, so no default is safe
         raise InputError(
-            "has no unit, and its name is that of no known catalogue",
+            "has no unit, and its name is not that of a known catalogue",
             where=column.where,
             do="write it into the file (mas, or mas / yr), or leave the column out: "
             f'columns = {{{key} = ""}}',
@@ -321,7 +321,7 @@ def _checked(column: SourceColumn, rho: Float) -> Float:
     beyond = np.abs(rho) > 1.0
     if beyond.any():
         bad = int(np.argmax(beyond))
-        raise column.fail(bad, f"a correlation is {rho[bad]:g}, and is 1 at most")
+        raise column.fail(bad, f"a correlation is {rho[bad]:g}, but must be at most 1")
     return rho
 
 

@@ -64,7 +64,7 @@ class StarCuts:
     def __post_init__(self) -> None:
         if self.mag is not None and not self.mag[0] < self.mag[1]:
             raise InputError(
-                f"magnitudes from {self.mag[0]} to {self.mag[1]} are none",
+                f"magnitudes from {self.mag[0]} to {self.mag[1]} are not a range",
                 where="cuts",
                 do="give the brightest and then the faintest",
             )
@@ -93,9 +93,9 @@ class StarCuts:
         for needed, name in ((by_mag, "mag"), (self.q_max is not None, "q")):
             if needed and getattr(stars, name) is None:
                 raise InputError(
-                    f"has no column {name!r}, and the cuts need it",
+                    f"has no column {name!r}, which the cuts need",
                     where=stars.where,
-                    do="name the column, or cut by something else",
+                    do="name the column, or choose other cuts",
                 )
         reasons: list[tuple[str, Bool]] = []
         if self.saturation is not None and stars.mag is not None:
@@ -156,13 +156,13 @@ def read_star_lists(
             raise InputError(
                 f"a list of the format {kind!r} has no errors of its pixels",
                 where=str(file),
-                do="have them measured, by magnitude",
+                do="set the errors to be measured by magnitude",
             )
         elif kind == "table":
             out += _of_table(read_table(file), columns, str(file), name, errors)
         else:
             raise FormatError(
-                f"has matches or a catalogue ({kind}), and star lists are asked for",
+                f"has matches or a catalogue ({kind}), but star lists are expected",
                 where=str(file),
                 do="give star lists, or tables with x, y",
             )

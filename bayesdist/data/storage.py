@@ -170,13 +170,13 @@ def open_matches(path: PathLike | Sequence[PathLike], **options: Unpack[ReadArgu
     reading = ReadOptions(**options)
     if reading.not_finite == "reject":
         raise InputError(
-            "rows of tables on disk cannot be left out in reading",
+            "rows of tables on disk cannot be left out while reading",
             where="data.not_finite",
             do="write the table without them",
         )
     if reading.plate_scale is not None:
         raise InputError(
-            "tables on disk are not brought to another unit",
+            "tables on disk cannot be converted to another unit",
             where="data.plate_scale",
             do="write u, v and their errors in arcsec",
         )
@@ -184,7 +184,7 @@ def open_matches(path: PathLike | Sequence[PathLike], **options: Unpack[ReadArgu
     for file in files:
         if file.suffix.lower() != ".parquet":
             raise FormatError(
-                "is no Parquet file, and others are read into memory",
+                "is not a Parquet file, and other files are read into memory",
                 where=str(file),
                 do="use read_matches",
             )

@@ -146,7 +146,7 @@ class Budget:
         """Raise FormatError for a line with too many characters; line numbers start at 1."""
         if n > self.limits.line:
             raise FormatError(
-                f"has {n} characters, and at most {self.limits.line} are read",
+                f"has {n} characters, but at most {self.limits.line} are read",
                 where=f"{self.where}, line {number}",
                 do="check that it is a table, and shorten the line",
             )

@@ -58,8 +58,8 @@ def _refuse_unfounded(raw: bytes, budget: Budget) -> None:
         if size is None or begin + size > len(raw):
             announced = "a size that is none" if size is None else f"{size} bytes"
             raise FormatError(
-                f"the header of HDU {number} announces {announced}, and "
-                f"{max(0, len(raw) - begin)} bytes follow",
+                f"the header of HDU {number} announces {announced}, but {max(0, len(raw) - begin)} "
+                "bytes follow",
                 where=file_name,
                 do="it is truncated or damaged: fetch or write it again",
             )
@@ -81,15 +81,15 @@ def refuse_rest(raw: bytes, end: int, budget: Budget) -> None:
     """
     if len(raw) < end:
         raise FormatError(
-            f"has {len(raw)} bytes, and its HDUs take up {end}",
+            f"has {len(raw)} bytes, but its HDUs take up {end}",
             where=budget.where,
             do="it is truncated: fetch or write it again",
         )
     rest = len(raw[end:].rstrip(b"\0 \r\n"))
     if rest:
         raise FormatError(
-            f"has {rest} bytes after its last HDU that are none, so that further HDUs may be "
-            "damaged or missing",
+            f"has {rest} bytes after its last HDU that are not part of any HDU, so further HDUs "
+            "may be damaged or missing",
             where=budget.where,
             do="fetch or write it again",
         )

@@ -187,7 +187,7 @@ class _Announced:
         compressors = [code for code in filters if code not in _FILTERS]
         if len(compressors) > 1 or not set(compressors) <= _COMPRESSORS:
             raise FormatError(
-                "has an array whose compression is not read",
+                "has an array with an unsupported compression",
                 where=self._budget.where,
                 do="write it with gzip, lzf, szip or none",
             )

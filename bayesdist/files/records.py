@@ -93,7 +93,7 @@ def record_from_arrays(
     tree = json_of(np.asarray(arrays[TREE], np.uint8).tobytes().decode(), "record")
     record = _Reader(arrays, {PACKAGE, *packages}).of(tree)
     if not isinstance(record, kind):
-        raise TypeError(f"holds a {type(record).__name__}, and no {kind.__name__}")
+        raise TypeError(f"holds a {type(record).__name__}, not a {kind.__name__}")
     return record
 
 
@@ -197,5 +197,5 @@ def _class(name: str, packages: Collection[str]) -> Any:
     cls = getattr(import_module(module), qualified, None) if known else None
     held = isinstance(cls, type) and (is_dataclass(cls) or hasattr(cls, "from_dict"))
     if not held or cls.__module__ != module:
-        raise TypeError(f"{name} is no class of the records of {', '.join(sorted(packages))}")
+        raise TypeError(f"{name} is not a class of the records of {', '.join(sorted(packages))}")
     return cls

@@ -124,9 +124,9 @@ def read_bytes(path: PathLike, *, most: int | None = None) -> bytes:
             ) from error
     if max(size, len(raw)) > most:
         raise InputError(
-            f"has {size_text(max(size, len(raw)))}, and at most {size_text(most)} are read",
+            f"has {size_text(max(size, len(raw)))}, but at most {size_text(most)} are read",
             where=str(path),
-            do="check that it is the file that is meant, or divide it",
+            do="check that it is the intended file, or split it",
         )
     return raw
 

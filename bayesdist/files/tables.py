@@ -179,7 +179,7 @@ def _refuse_unreadable_cells(raw: bytes, path: Path) -> None:
                 column += 1
                 if kind in ("float", "double") and not _says_number(content):
                     raise FormatError(
-                        f"{content.strip()[:40]!r} is no number",
+                        f"{content.strip()[:40]!r} is not a number",
                         where=f"{path}, row {row}, column {name!r}",
                         do="correct the cell or leave it empty",
                     )
@@ -284,7 +284,7 @@ def read_table(path: Path, limits: Limits = LIMITS) -> Table:
         reader = _read_text
     if reader is None:
         raise InputError(
-            f"extension {path.suffix!r} is not one of a table",
+            f"extension {path.suffix!r} is not known for tables",
             where=str(path),
             do=f"give a file that ends in {', '.join(TABLE_SUFFIXES)}, or set the format",
         )
@@ -354,7 +354,7 @@ class _Scan:
 
     def doctype(self, *_: object) -> NoReturn:
         raise FormatError(
-            "has a document type (DOCTYPE), which is not read",
+            "has a document type (DOCTYPE), which is not supported",
             where=self.budget.where,
             do="remove it",
         )
@@ -374,7 +374,8 @@ class _Scan:
         self.budget.refuse_depth(self.depth, "elements")
         if name == "STREAM" and any(_local(key) == "href" for key in attributes):
             raise FormatError(
-                "its data lie elsewhere (STREAM with href), and nothing is fetched",
+                "its data lie elsewhere (STREAM with href), but other files and addresses are not "
+                "read",
                 where=self.budget.where,
                 do="write a VOTable that holds its data",
             )
@@ -426,7 +427,7 @@ class _Scan:
         """Refuse too many rows of base64 binary data, and rows without bytes."""
         width = sum(width_in_stream for width_in_stream, _ in self.fields)
         if not width:
-            raise FormatError("has rows of no bytes", where=self.budget.where, do=DAMAGED)
+            raise FormatError("has rows of zero bytes", where=self.budget.where, do=DAMAGED)
         rows = self.letters * 3 // 4 // width
         self.budget.refuse_rows(rows, "holds")
         self.budget.refuse_cells(rows * len(self.fields))

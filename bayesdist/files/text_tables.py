@@ -129,7 +129,7 @@ def with_decimal_points(lines: list[str], mark: str | None, *, where: str) -> li
         raise FormatError(
             f"some numbers have commas ({with_comma[0]}), and {also}",
             where=where,
-            do="write all numbers with decimal points, without marks between thousands",
+            do="write all numbers with decimal points and without thousands separators",
         )
     log.info("%s: the commas in its numbers are taken as decimal commas", where)
     return [_pointed(line, mark) if "," in line else line for line in lines]
@@ -327,10 +327,9 @@ def refuse_foreign_numbers(
             if foreign.fullmatch(cell.strip()) and (not complete or columns[names[k]]):
                 name = f", column {names[k]!r}" if complete else ""
                 raise FormatError(
-                    f"{cell[:40]!r} is no number",
+                    f"{cell[:40]!r} is not a number",
                     where=f"{where}, line {number}{name}",
-                    do="write it in decimal digits, with no marks between or blanks other than "
-                    "spaces around them",
+                    do="write it in decimal digits without separators; only spaces may surround it",
                 )
 
 
@@ -347,7 +346,7 @@ def _daophot_list(lines: Sequence[str], where: str) -> Table:
     for number, row in enumerate(rows, start=1):
         if len(row) < len(names) or len(row) != len(rows[0]):
             raise FormatError(
-                f"has {len(row)} numbers, and the first row {len(rows[0])}",
+                f"has {len(row)} numbers, but the first row has {len(rows[0])}",
                 where=f"{where}, row {number}",
                 do="the list may be truncated: fetch or write it again",
             )

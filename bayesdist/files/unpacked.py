@@ -156,7 +156,7 @@ def read_lines(path: PathLike, limits: Limits = LIMITS) -> list[str]:
     nul = raw.find(b"\0")
     if nul >= 0 and not raw.startswith((BOM_UTF16_LE, BOM_UTF16_BE)):
         raise FormatError(
-            "has a NUL character, which no text has",
+            "has a NUL character, which is not allowed in text",
             where=f"{path}, line {len((raw[:nul] + b'.').splitlines())}",
             do="it is damaged: fetch or write it again",
         )

@@ -167,13 +167,15 @@ def _calibration(found: GbdesParameters, name: str, choice: Choice) -> Calibrati
     """Calibration in degrees from the maps of the detectors, with their joint covariance."""
     if choice.size is None:
         raise MissingSizeError(
-            "does not say how large the detectors are",
+            "does not state the size of the detectors",
             where=name,
             do="give it (size=(NX, NY) in Python, --size NX NY on the command line)",
         )
     wrong = [f for f in _lint(found) if f.level == "error"]
     if wrong:
-        raise FormatError(wrong[0].message, where=f"{name}, {wrong[0].where}", do="mend the table")
+        raise FormatError(
+            wrong[0].message, where=f"{name}, {wrong[0].where}", do="correct the table"
+        )
     devices = found.devices(choice.filter)
     order = max(1, *(found.order(rows) for rows in devices.values()))
     values = np.asarray(found.table["parameter"], float)

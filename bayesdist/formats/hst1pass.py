@@ -295,7 +295,7 @@ def _fields(line: str, n_columns: int) -> list[str]:
     if len(fields) < n_columns:
         raise ValueError(f"has {len(fields)} of {n_columns} columns")
     if "_" in line or not line.isascii():  # Python would accept these as parts of numbers
-        raise ValueError(f"{line.strip()[:40]!r} holds other characters than numbers do")
+        raise ValueError(f"{line.strip()[:40]!r} contains characters that are not part of a number")
     return fields
 
 
@@ -345,7 +345,7 @@ def read_matchup(
         raise FormatError(
             "is no MATCHUP master: its head names no xbar, ybar, ... and no x, y, m, xe, ye, ...",
             where=str(path),
-            do="set the format that the file has",
+            do="set the format to that of the file",
         )
     if not lines[0].startswith("#"):
         lines = ["#" + lines[0], *lines[1:]]

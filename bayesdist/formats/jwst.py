@@ -36,8 +36,8 @@ def _node(content: Content) -> tuple[Mapping[str, Any], str] | None:
     if "model" not in tree or not isinstance(tree.get("meta"), Mapping):
         named = ", ".join(sorted(set(tree) - {"asdf_library", "history"}))
         raise FormatError(
-            f"is an ASDF file that holds {named or 'nothing'}, and not model and meta, as JWST's "
-            "distortion has, or roman",
+            f"is an ASDF file that holds {named or 'nothing'}, instead of model and meta (as in "
+            "JWST's distortion files) or roman",
             where=content.name,
             do="give a distortion reference file of an imager",
         )
@@ -126,10 +126,10 @@ def lint_meta(meta: Mapping[str, Any]) -> Iterator[Finding]:
         "not there, and JWST's DistortionModel asks for it",
     )
     if not meta.get("exposure", {}).get("type"):
-        yield Finding("note", "meta.exposure.type", "is missing; files are chosen by it")
+        yield Finding("note", "meta.exposure.type", "is missing, although files are selected by it")
     reftype = str(meta.get("reftype", ""))
     if reftype and reftype.lower() != "distortion":
-        yield Finding("error", "meta.reftype", f"is {reftype!r}, and not 'distortion'")
+        yield Finding("error", "meta.reftype", f"is {reftype!r}, not 'distortion'")
     detector = str(instrument.get("detector", ""))
     if instrument.get("name") == "NIRCAM" and detector.startswith("NRC") and len(detector) > 3:
         stated = instrument.get("module"), instrument.get("channel")

@@ -39,7 +39,7 @@ def _node(content: Content) -> tuple[Mapping[str, Any], str] | None:
     if not isinstance(tree, Mapping) or KEY not in tree or "meta" not in tree:
         held = ", ".join(sorted(tree)) if isinstance(tree, Mapping) else "nothing"
         raise FormatError(
-            f"holds {held or 'nothing'} under roman, and not meta and {KEY}",
+            f"holds {held or 'nothing'} under roman, instead of meta and {KEY}",
             where=content.name,
             do="give a distortion reference file of the WFI",
         )

@@ -171,7 +171,7 @@ def start_of(calibration: Calibration, unit_arcsec: float) -> Start:
     """Distortion of a calibration in the given unit of u and v, up to rotation and shift."""
     if calibration.unit not in ARCSEC:
         raise InputError(
-            f"states positions in {calibration.unit}, and an initial distortion is in angles",
+            f"states positions in {calibration.unit}, but an initial distortion must be in angles",
             where=calibration.name,
             do="give a calibration whose positions are in arcsec or deg",
         )

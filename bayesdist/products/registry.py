@@ -79,7 +79,7 @@ def recognized(content: Content) -> Document:
         for hdu in content.hdus:
             if not isinstance(hdu.header.get("EXTNAME", ""), str):
                 raise FormatError(
-                    f"the name of HDU {hdu.number} (EXTNAME) is no text",
+                    f"the name of HDU {hdu.number} (EXTNAME) is not text",
                     where=content.name,
                     do="correct the card, or write the file again",
                 )
@@ -92,7 +92,7 @@ def recognized(content: Content) -> Document:
         raise content.damage
     titles = [format_.title for format_ in all_formats()]
     raise InputError(
-        "is of no kind that is understood here",
+        "has an unknown format",
         where=content.name,
         do=f"give {', '.join(titles[:-1])}, or {titles[-1]}"
         if titles
@@ -274,8 +274,8 @@ def build(
     format_ = format_of(key)
     if calibration.model.order > format_.highest_order:
         raise InputError(
-            f"the order is {calibration.model.order}, and polynomials of {format_.title} go "
-            f"up to order {format_.highest_order}",
+            f"the order is {calibration.model.order}, but polynomials of {format_.title} are "
+            f"limited to order {format_.highest_order}",
             where=f"products.{key}",
             do=f"give order {format_.highest_order} (--order of convert), or choose another format",
         )

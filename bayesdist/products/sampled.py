@@ -106,7 +106,7 @@ def sampled_calibration(
         if largest < GOOD_PIX * positions.pixel_arcsec:
             break
     if best is None:
-        raise InputError("no order is tried", where="--order", do="give an order of at least 1")
+        raise InputError("no order is given", where="--order", do="give an order of at least 1")
     largest, rms, fitted = best
     calibration = calibration_of_maps(
         {1: fitted},
@@ -135,7 +135,7 @@ def _celestial(content: Content) -> tuple[fits.Header, WCS]:
             continue
         if wcs.naxis != 2:
             raise InputError(
-                f"has {wcs.naxis} axes, and only images of two celestial axes are sampled",
+                f"has {wcs.naxis} axes, but only images with two celestial axes can be sampled",
                 where=content.name,
                 do="write the header of the two celestial axes: astropy.wcs.WCS(header).celestial",
             )
@@ -143,7 +143,7 @@ def _celestial(content: Content) -> tuple[fits.Header, WCS]:
     raise InputError(
         "has no header with two celestial axes",
         where=content.name,
-        do="leave out --sample, which is for headers that astropy.wcs reads",
+        do="leave out --sample, which requires a header that astropy.wcs reads",
     )
 
 
@@ -204,7 +204,7 @@ class _Positions:
             at = SkyCoord(lon, lat, unit=units, frame=frame)
             if not hasattr(at, "icrs") or not at.is_transformable_to("icrs"):
                 raise InputError(
-                    f"has coordinates ({frame.name}) that cannot be turned to ICRS",
+                    f"has coordinates ({frame.name}) that cannot be transformed to ICRS",
                     where=self.where,
                     do="give a header of right ascension and declination",
                 )

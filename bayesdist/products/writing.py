@@ -180,7 +180,7 @@ def refuse_unknown_scale(
     """Raise InputError if u and v are in pixels of unknown scale and the file states angles."""
     if calibration.unit == "pix" and scale is None and target.needs_scale(settings):
         raise InputError(
-            f"is in pixels of unknown size, and {target.title} states angles",
+            f"is in pixels of unknown size, but {target.title} stores angles",
             where=calibration.name,
             do="give the pixel scale (scale_mas in Python, --scale of convert)",
         )
@@ -211,9 +211,9 @@ def places_of(built: Sequence[Built], target: Path) -> list[Path]:
     names = [part.file_name for part in built if part.kind != PARAMETERS]
     if len(names) > 1:
         raise InputError(
-            f"{len(names)} files are made ({', '.join(names)})",
+            f"{len(names)} files would be written ({', '.join(names)})",
             where=str(target),
-            do="name a folder that exists",
+            do="name an existing folder",
         )
     return [target.parent / part.file_name if part.kind == PARAMETERS else target for part in built]
 

@@ -183,7 +183,7 @@ def _present(results: Any, path: str) -> bool:
 def needed(value: T | None) -> T:
     """Value that is not None because the registry has checked `needs` of the entry."""
     if value is None:
-        raise LookupError("a figure is drawn without what it needs")
+        raise LookupError("a figure is drawn without its required input")
     return value
 
 

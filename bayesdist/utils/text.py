@@ -67,7 +67,7 @@ def number_of(text: str) -> float:
     """
     plain = text.strip(" \t\r\n")
     if _NUMBER.fullmatch(plain) is None:
-        raise ValueError(f"{text[:40]!r} is no number")
+        raise ValueError(f"{text[:40]!r} is not a number")
     return float(plain)
 
 

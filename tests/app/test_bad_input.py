@@ -427,17 +427,17 @@ def test_what_is_no_run_points_to_the_run_within(tmp_path):
     (tmp_path / "file").touch()
     at = ("--at", 1, 1)
     within = str(tmp_path / "demo" / "run")
-    refused(tmp_path, "budget", tmp_path / "demo", *at, words=["is no run", f"give {within}"])
-    refused(tmp_path, "monitor", tmp_path / "demo", "x", words=["is no run", f"give {within}"])
+    refused(tmp_path, "budget", tmp_path / "demo", *at, words=["is not a run", f"give {within}"])
+    refused(tmp_path, "monitor", tmp_path / "demo", "x", words=["is not a run", f"give {within}"])
     refused(tmp_path, "plan", tmp_path / "none", words=["none: there is no such folder"])
     refused(tmp_path, "plan", tmp_path / "file", words=["file: is a file, not the folder of a run"])
-    refused(tmp_path, "plan", tmp_path, words=["is no run", "bayesdist run"])
+    refused(tmp_path, "plan", tmp_path, words=["is not a run", "bayesdist run"])
 
 
 def test_validate_of_what_is_no_run(tmp_path):
     path = tmp_path / "req.toml"
     path.write_text('[[requirement]]\nname = "r"\nstatistic = "p95"\nlimit = 1\n')
-    refused(tmp_path, "requirements", tmp_path, "--requirements", path, words=["is no run"])
+    refused(tmp_path, "requirements", tmp_path, "--requirements", path, words=["is not a run"])
 
 
 @pytest.mark.parametrize(

@@ -232,7 +232,7 @@ WRONG = {
     "no settings": ({"settings": "x"}, "sections"),
     "no TOML": ({"settings": {"sampler": {"max_steps": object()}}}, "TOML"),
     "not finite": ({"size": (np.nan, 800)}, "calibrate: size"),
-    "options of reading": ({"settings": {"data": {"epoch": 2020.0}}}, "have been read"),
+    "options of reading": ({"settings": {"data": {"epoch": 2020.0}}}, "have already been read"),
     "another kind": ({"settings": {"campaign": {"catalogue": "x"}}}, "give one"),
 }
 
@@ -286,7 +286,7 @@ def test_wrong_questions_are_named(run):
         run.wcs(point=(1.0, 2.0), pixel_scale=0.05, epoch="never")
     with pytest.raises(bd.InputError, match="epoch"):
         run.map(epoch=16.5)
-    with pytest.raises(bd.InputError, match="is no run"):
+    with pytest.raises(bd.InputError, match="is not a run"):
         bd.open_run(Path(__file__).parent)
 
 

@@ -102,7 +102,7 @@ def as_days(table: Table) -> None:
 
 def test_epochs_in_days_are_told_from_years(campaign):
     campaign.log(as_days)
-    campaign.refused("row 1", "'epoch'", "no year", "'d'")
+    campaign.refused("row 1", "'epoch'", "not a year", "'d'")
 
 
 @pytest.mark.parametrize("kind", ["days", "dates", "texts"])
@@ -282,7 +282,7 @@ def test_a_catalogue_of_the_wrong_field(campaign):
 
     said = campaign.catalog(change).unmatched("f606w-001", "bring together", "1 more of 8")
     assert int(said.split("bring together ")[1].split()[0]) >= 6  # the best number by chance
-    assert "where chance gives" in said
+    assert "while chance gives" in said
 
 
 @pytest.mark.parametrize(("factor", "said"), [(0.05, "0.05 times"), (50.0, "50 times")])

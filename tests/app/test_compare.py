@@ -207,7 +207,13 @@ def test_a_header_without_size_takes_that_of_the_other(solution, tmp_path) -> No
     sip = sip_header(tmp_path / "a.hdr", A, B)
     lines = [line for line in sip.read_text().splitlines() if not line.startswith("IMAGE")]
     (tmp_path / "b.hdr").write_text("\n".join(lines) + "\n")
-    refused(tmp_path, "compare", tmp_path / "b.hdr", tmp_path / "b.hdr", words=["how large"])
+    refused(
+        tmp_path,
+        "compare",
+        tmp_path / "b.hdr",
+        tmp_path / "b.hdr",
+        words=["does not state the size"],
+    )
     out = good("compare", tmp_path / "b.hdr", sip).out
     assert out.startswith("The calibrations agree to rounding.")
 
@@ -234,7 +240,7 @@ def test_what_is_no_calibration_is_refused(finished, tmp_path) -> None:
     folder = tmp_path / "in"
     folder.mkdir()
     run = finished.path
-    refused(tmp_path, "compare", run, tmp_path / "text", words=["of no kind that is understood"])
+    refused(tmp_path, "compare", run, tmp_path / "text", words=["an unknown format"])
     refused(tmp_path, "compare", run, tmp_path / "none.fits", words=["no such file"])
     refused(tmp_path, "compare", run, folder, words=["in"])
     refused(tmp_path, "compare", run, run, "--grid", 1, 1, words=["grid"])

@@ -408,8 +408,8 @@ def test_an_old_key_names_the_new_one(path):
 def test_a_unit_of_what_has_none_is_refused():
     block = {"name": "tilt", "kind": "rotation", "sigma": 1e-6}
     error = refusal(of_kind("campaign", budget=[block | {"unit": "mas"}]))
-    assert "has a unit of its own, and unit is 'mas'" in error.cause
-    assert error.do == "leave unit out"
+    assert "has a fixed unit, but unit is 'mas'" in error.cause
+    assert error.do == "leave out unit"
 
 
 @pytest.mark.parametrize(

@@ -97,7 +97,9 @@ def test_a_field_is_of_a_detector_of_one_chip():
         {"number": n, "name": f"C{n}", "size": (9, 9), "reference_pixel": (5, 5)} for n in (1, 2)
     ]
     settings = {"data": {"matches": "a.csv"}, "model": {"order": 1}, "chip": chips}
-    with pytest.raises(ValueError, match=r"detector\.field is of a detector of one chip"):
+    with pytest.raises(
+        ValueError, match=r"detector\.field applies to a detector with a single chip"
+    ):
         MatchesConfig(**settings, detector={"field": {"centre": (5, 5), "radius": 3}})
 
 

@@ -151,8 +151,8 @@ def test_whole_exposures_are_drawn_and_predicted(tmp_path):
 @pytest.mark.parametrize(
     ("holdout", "words"),
     [
-        ({}, ("sets nothing aside",)),
-        ({"fraction": 0.01}, ("say too little", "holdout.fraction")),
+        ({}, ("holds nothing out",)),
+        ({"fraction": 0.01}, ("too few to judge", "holdout.fraction")),
         ({"exposures": ["nobody"]}, ("nobody",)),
         ({"exposures": 3}, ("there are 1",)),
         ({"fraction": 0.95}, ("holdout.fraction",)),

@@ -177,9 +177,9 @@ def test_errors_far_too_small_are_scaled_first(tmp_path):
         ({"outliers": {"jitter_by": True}}, ("outliers.jitter_by",)),
         ({"outliers": {"jiter_by": "chip"}}, ("jiter_by", "'jitter_by'")),
         ({"outliers": {"jitter_by": "exposure", "jitter": 0.1}}, ("outliers.jitter gives",)),
-        ({"outliers": {"jitter_by": "chip"}}, ("there is one chip",)),
-        ({"outliers": {"jitter_by": "exposure"}}, ("all matches are of one exposure",)),
-        ({"outliers": {"jitter_by": "filter"}}, ("all matches are of one filter",)),
+        ({"outliers": {"jitter_by": "chip"}}, ("there is only one chip",)),
+        ({"outliers": {"jitter_by": "exposure"}}, ("all matches have the same exposure",)),
+        ({"outliers": {"jitter_by": "filter"}}, ("all matches have the same filter",)),
         (
             {
                 "outliers": {"jitter_by": "exposure"},

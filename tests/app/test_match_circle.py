@@ -92,7 +92,10 @@ def test_a_star_outside_its_circle(tmp_path):
             {"periods": {"centres": [52000.0, 52100.0], "days": 9.0}},
             ["[periods]", "leave [periods] out"],
         ),
-        ({"data": {"format": "rvb"}}, ["data.format is 'rvb'", "leave u_nominal and v_nominal"]),
+        (
+            {"data": {"format": "rvb"}},
+            ["data.format is 'rvb'", "leave out u_nominal and v_nominal"],
+        ),
         ({"data": {"format": "hst1pass"}}, ["data.format is 'hst1pass'"]),
     ],
 )
@@ -120,7 +123,7 @@ def test_a_self_calibration_has_none():
         data=None, model={"order": 2},
         selfcal={"lists": "*.csv", "exposures": "log.csv", "columns": NAMED},
     )  # fmt: skip
-    with pytest.raises(ConfigError, match="nominal positions are of matches in"):
+    with pytest.raises(ConfigError, match="nominal positions belong to matches in"):
         parse_config(text, "c.toml")
 
 

@@ -101,7 +101,7 @@ def test_a_package_adds_a_format_of_matches(tmp_path):
     commands = encoded([("check", "tenths.toml"), ("check", "tents.toml")])
     known, unknown = results_of(called(tmp_path, *commands, module="tests.app.several"))
     for checked, refused in ((known, False), (unknown, True)):
-        assert ("which is no format" in checked.err) is refused
+        assert ("which is not a known format" in checked.err) is refused
         assert ("'tenths'" in checked.err) is refused
 
 

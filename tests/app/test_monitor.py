@@ -98,7 +98,7 @@ def test_what_does_not_go_is_refused(finished, tmp_path) -> None:
     empty = tmp_path / "empty"
     empty.mkdir()
     run = finished.path
-    refused(tmp_path, "monitor", empty, tmp_path / "few.ecsv", words=["is no run"])
+    refused(tmp_path, "monitor", empty, tmp_path / "few.ecsv", words=["is not a run"])
     refused(tmp_path, "monitor", run, tmp_path / "none.ecsv", words=["no such file"])
     refused(tmp_path, "monitor", run, tmp_path / "unit.ecsv", words=["arcsec", "pix"])
     refused(tmp_path, "monitor", run, tmp_path / "few.ecsv", words=["few"])
@@ -107,7 +107,7 @@ def test_what_does_not_go_is_refused(finished, tmp_path) -> None:
 def test_the_matches_of_the_release_cannot_test_it(finished, tmp_path) -> None:
     """Under their own name, as a copy, by a configuration, and among others."""
     old = finished.config.parent / "stars.ecsv"
-    words = ["matches that the release was made from"]
+    words = ["the release was made from these matches"]
     refused(tmp_path, "monitor", finished.path, old, words=["stars.ecsv", *words])
     shutil.copy(old, tmp_path / "copy.ecsv")
     refused(tmp_path, "monitor", finished.path, tmp_path / "copy.ecsv", words=["copy.ecsv", *words])

@@ -271,7 +271,7 @@ def test_right_ascensions_in_hours_are_named(rng, tmp_path):
 def test_a_stated_scale_that_is_not_that_of_the_fit_is_refused(rng, tmp_path):
     done = cli("check", job(tmp_path / "wrong", rng, scale_mas=400.0))
     assert done.code == 1 and "detector.scale_mas" in done.err
-    assert "given as 400 mas, and that of the fit is 150.0" in done.err
+    assert "given as 400 mas, but that of the fit is 150.0" in done.err
 
 
 def test_check_says_the_geometry(rng, tmp_path):
@@ -387,14 +387,14 @@ def requirement(more: str) -> str:
     [
         ({"data": f"x = {DEEP}"}, "brackets"),
         ({"data": "epoch = " + "1" * 100_000}, "thousands of digits"),
-        ({"data": "epoch = 1e300"}, "data.epoch: 1e+300 is no plausible number"),
-        ({"data": "sigma = 1e-300"}, "data.sigma: 1e-300 is no plausible number"),
+        ({"data": "epoch = 1e300"}, "data.epoch: 1e+300 is not a plausible number"),
+        ({"data": "sigma = 1e-300"}, "data.sigma: 1e-300 is not a plausible number"),
         ({"data": "epoch = 55197.5"}, "data.epoch: 55197.5 does not fit"),
         ({"data": "tangent_point = [0.0, 91.0]"}, "less than or equal to 90"),
         ({"data": "tangent_point = [1e9, 1e9]"}, "less than or equal to 360"),
         ({"more": "[model.tdd]\nterms = []\nepoch0 = 1e300"}, "model.tdd.epoch0: 1e+300 is no"),
         ({"more": "[model.tdd]\nterms = []\nepoch0 = 53000.0"}, "model.tdd.epoch0"),
-        ({"more": "[fit]\nclip_chi2 = 1e300"}, "fit.clip_chi2: 1e+300 is no plausible number"),
+        ({"more": "[fit]\nclip_chi2 = 1e300"}, "fit.clip_chi2: 1e+300 is not a plausible number"),
         ({"more": "[fit]\nclip_abs = 1e12"}, "fit.clip_abs: 1000000000000.0 does not fit"),
         ({"more": "[assess]\ngrid = [100000, 100000]"}, "assess.grid[1]: 100000 does not fit"),
         ({"more": "[assess]\ndraws = 1000000000"}, "assess.draws: 1000000000 does not fit"),

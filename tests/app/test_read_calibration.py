@@ -43,7 +43,11 @@ def test_the_size_of_a_pixel_is_that_of_the_run(finished, tmp_path):
 def test_what_is_no_calibration_is_refused(tmp_path, name):
     (tmp_path / "notes.txt").write_text("nothing\n")
     (tmp_path / "empty").mkdir()
-    words = {"gone": "there is no such file", "notes.txt": "is of no kind", "empty": "and no run"}
+    words = {
+        "gone": "there is no such file",
+        "notes.txt": "has an unknown format",
+        "empty": "but not a run",
+    }
     with pytest.raises(bd.InputError, match=f"{name}: .*{words[name]}") as refused:
         bd.read_calibration(tmp_path / name)
     assert "\n" not in str(refused.value)

@@ -98,7 +98,7 @@ def test_the_report_judges_them_again_as_they_were_asked(run):
         ('region = "middle"', "no region 'middle'"),
         ("region = [[1.0, 1.0], [2.0, 2.0], [3.0, 1.5]]", "holds 0 points"),
         ("epochs = [2010.0, 2012.0]", "does not depend on time"),
-        ("separation = 5.0", "of two positions"),
+        ("separation = 5.0", "needs two positions"),
         ("magnitude = 99.0", "were not measured"),
     ],
 )

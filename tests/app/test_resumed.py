@@ -104,10 +104,14 @@ def test_products_that_are_no_longer_asked_for_go(finished, run):
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("order = 2", "order = 3", ("model.order = 3", "began with 2")),
-        ("[sampler]", "[sampler]\nwalkers = 80", ("sampler.walkers = 80", "began with none")),
-        ("[sampler]", "[sampler]\nseed = 7", ("sampler.seed = 7", "began with 1")),
-        ("[assess]", "[fit]\nclip_abs = 3.0\n[assess]", ("fit.clip_abs = 3.0", "began with 2.0")),
+        ("order = 2", "order = 3", ("model.order = 3", "was started with 2")),
+        ("[sampler]", "[sampler]\nwalkers = 80", ("sampler.walkers = 80", "was started with none")),
+        ("[sampler]", "[sampler]\nseed = 7", ("sampler.seed = 7", "was started with 1")),
+        (
+            "[assess]",
+            "[fit]\nclip_abs = 3.0\n[assess]",
+            ("fit.clip_abs = 3.0", "was started with 2.0"),
+        ),
     ],
 )
 def test_the_solution_is_what_a_run_is(finished, run, tmp_path, old, new, words):

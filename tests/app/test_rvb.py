@@ -238,7 +238,7 @@ def test_wrong_commands_write_nothing(tmp_path):
     refused(tmp_path, *begin, "--dx", 1, "--band", "W2", words=["does not contain W2"])
     refused(tmp_path, *begin, "--dx", "nan", "--band", "W4", words=["shift_u", "nan"])
     refused(tmp_path, *begin, "--dx", 1, "--columns", "u", words=["--columns", "KEY=NAME"])
-    refused(tmp_path, *begin, "--dx", 1, "--columns", "w=u", words=["'w'", "no quantity"])
+    refused(tmp_path, *begin, "--dx", 1, "--columns", "w=u", words=["'w'", "not a known quantity"])
     refused(tmp_path, "wise", "rvb", "transform", tmp_path / "none.tbl", *out, "--dx", 1,
             words=["none.tbl"])  # fmt: skip
     folder = write_rvb_table(rvb_pairs(), tmp_path / "set" / "a.parquet").parent

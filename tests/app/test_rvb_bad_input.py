@@ -90,7 +90,11 @@ CASES: dict[str, tuple[Callable[[], Table], dict[str, Any], list[str]]] = {
     "infinite": (_set("v", 8, np.inf), {}, ["row 8, column 'v'", "inf"]),
     "negative error": (_set("sigma_u", 9, -0.1), {}, ["row 9, column 'sigma_u'", "-0.1"]),
     "a column that is not there": (rvb_pairs, {"data": {"columns": {"u": "ux"}}}, ["'ux'"]),
-    "no quantity": (rvb_pairs, {"data": {"columns": {"hue": "colour"}}}, ["'hue'", "no quantity"]),
+    "not a known quantity": (
+        rvb_pairs,
+        {"data": {"columns": {"hue": "colour"}}},
+        ["'hue'", "not a known quantity"],
+    ),
     "nothing is left": (
         rvb_pairs,
         {"data": {"rvb": {"colour": (8.0, 9.0)}}},

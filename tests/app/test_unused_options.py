@@ -86,7 +86,7 @@ OF_FILES = [
     for option, sentence in (
         ("--epoch 2020", "does not depend on time"),
         ("--filter F606W", "whose filter is not chosen"),
-        ("--size 9 9", "states a size of 1024 x 1024 pixels, and 9 x 9 are given"),
+        ("--size 9 9", "states a size of 1024 x 1024 pixels, but 9 x 9 are given"),
     )
     if not (command.startswith("hst") and "size" in option)
 ]
@@ -108,7 +108,7 @@ def test_an_option_that_the_file_has_no_use_for_is_refused(
     before = sorted(header_folder.iterdir())
     result = cli(*words.split())
     assert result.code == 1 and "a.hdr" in result.err
-    assert sentence in result.err and "on the command line) out" in result.err
+    assert sentence in result.err and "on the command line)" in result.err
     assert sorted(header_folder.iterdir()) == before
 
 

@@ -109,7 +109,7 @@ CASES = [
     ("one NaN", with_nan, {}, 'leave out 1 of 200 with data.not_finite = "reject"'),
     ("all NaN", change(x=lambda t: t["x"] * np.nan), {}, "no value in column 'x' (200 rows)"),
     ("sexagesimal with letters", change(ra=seconds_of_time), {}, "column 'ra'"),
-    ("units in cells", change(x=lambda t: [f"{v:.2f}px" for v in t["x"]]), {}, "must be"),
+    ("units in cells", change(x=lambda t: [f"{v:.2f}px" for v in t["x"]]), {}, "is not a number"),
     ("repeated rows", lambda t: t.add_row(t[0]), {}, "keep each row once"),
     ("two detections", detected_twice, {}, "several detections in one exposure"),
     ("binned", change(x=lambda t: t["x"] / 2, y=lambda t: t["y"] / 2), {}, "span 2"),

@@ -154,7 +154,7 @@ def test_diagnostics_belong_to_their_posterior(steps, shifting):
     matches, fit, _, diagnostics = steps
     with pytest.raises(InputError) as error:
         check_requirements(fit, [EASY], diagnostics=diagnostics)
-    assert "of a posterior, and the solution is a LinearFit; give the posterior" in said(error)
+    assert "of a posterior, but the solution is a LinearFit; give the posterior" in said(error)
     other = sample(
         fit_linear(matches, build_model(matches, order=1, size=SIZE)), matches, target_ess=50
     )
@@ -244,7 +244,7 @@ def test_sizes_of_catalogues_and_terms_may_have_units():
     term = UserTerm("flat field", "random", 1 * u.uas, 2 * u.uas)
     assert term.unit == "mas" and (term.sigma_u, term.sigma_v) == pytest.approx((1e-3, 2e-3))
     assert not term.varies and UserTerm("Gaia DR3", "systematic", 1.0, 1.0).varies
-    with pytest.raises(InputError, match="included_in_scatter is of a random budget term"):
+    with pytest.raises(InputError, match="included_in_scatter applies only to random budget terms"):
         UserTerm("a", "systematic", 1.0, 1.0, included_in_scatter=True)
 
 

@@ -90,7 +90,7 @@ def test_local_terms_are_interpolated_and_counted_twice_in_a_difference(solution
     [
         ({"x": [200.0]}, "x = 200 is not on chip 1"),
         ({"y": [0.0]}, "y = 0 is not on chip 1"),
-        ({"relative": True}, "of two positions"),
+        ({"relative": True}, "needs two positions"),
         ({"magnitude": 3.0}, "magnitude 3 is not known"),
         ({"chip": 7}, "chip 7"),
     ],

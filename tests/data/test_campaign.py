@@ -209,7 +209,7 @@ def test_a_wrong_field_is_named_with_the_best_count(rng):
     uv, mag = positions(rng, 2500, 6000.0)
     other = ReferenceCatalog(u=uv[:, 0], v=uv[:, 1], mag=mag, source="elsewhere.ecsv")
     message = (
-        r"e0\.parquet, exposure e0: does not match elsewhere\.ecsv: .* \d+ stars, where chance"
+        r"e0\.parquet, exposure e0: does not match elsewhere\.ecsv: .* \d+ stars, while chance"
     )
     with pytest.raises(InputError, match=message):
         match_campaign(lists, log, other, start)

@@ -149,7 +149,7 @@ def test_motions_need_an_epoch():
 def test_bad_catalogues_are_named():
     with pytest.raises(InputError, match="row 2, column 'v'"):
         ReferenceCatalog(u=[1.0, 2.0], v=[1.0, np.nan])
-    with pytest.raises(InputError, match="'pm_v' is missing beside its partner"):
+    with pytest.raises(InputError, match="'pm_v' is given without its partner"):
         ReferenceCatalog(u=[1.0], v=[1.0], pm_u=[1.0])
     with pytest.raises(InputError, match="not negative"):
         ReferenceCatalog(u=[1.0], v=[1.0], sigma_u=[-1.0], sigma_v=[1.0])

@@ -55,7 +55,7 @@ def test_a_star_keeps_its_code(rng):
     table = Table({"u": [1.0, 2.0], "v": [1.0, 2.0], "star": [big, big + 1]})
     assert catalog_from_table(table, unit="pix").star.tolist() == [big, big + 1]
     table["star"] = [7, 7]
-    with pytest.raises(InputError, match="row 2, column 'star': star 7 stands twice"):
+    with pytest.raises(InputError, match="row 2, column 'star': star 7 occurs twice"):
         catalog_from_table(table, unit="pix")
     with pytest.raises(InputError, match="codes of the stars"):
         replace(c, star=np.array([-1, 0, 1]))

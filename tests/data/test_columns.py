@@ -80,7 +80,7 @@ def test_a_missing_column_is_answered_with_the_nearest():
 def test_text_among_numbers_is_named():
     t = stars()
     t["u"] = ["1", "2", "abc", "4", "5", "6"]
-    with pytest.raises(InputError, match=r"row 3, column 'u': 'abc' stands where a number must"):
+    with pytest.raises(InputError, match=r"row 3, column 'u': 'abc' is not a number"):
         read(t)
     t["u"] = [True] * 6
     with pytest.raises(InputError, match="column 'u': holds values of type bool"):
@@ -146,7 +146,7 @@ def test_units_missing_or_contradictory():
         read(t, unit=None)
     t = stars(su=np.ones(6), sv=np.ones(6))
     t["su"].unit = "mas"
-    with pytest.raises(InputError, match="column 'su': unit mas cannot be brought to pix"):
+    with pytest.raises(InputError, match="column 'su': unit mas cannot be converted to pix"):
         read(t)
     t = stars()
     t["x"].unit = "mm"
@@ -191,11 +191,11 @@ def test_epochs_in_all_their_forms_agree():
 def test_epochs_that_are_none():
     with pytest.raises(InputError, match="row 1, column 'epoch': epoch is 53188"):
         read(stars(epoch=np.full(6, 53188.0)))
-    with pytest.raises(InputError, match="row 2, column 'epoch': 'spring' is no date"):
+    with pytest.raises(InputError, match="row 2, column 'epoch': 'spring' is not a date"):
         read(stars(epoch=["2004-01-01", "spring"] * 3))
     t = stars(epoch=np.full(6, 5.0))
     t["epoch"].unit = "m"
-    with pytest.raises(InputError, match="unit m is not one of dates"):
+    with pytest.raises(InputError, match="unit m is not a unit of dates"):
         read(t)
 
 
@@ -204,7 +204,7 @@ def test_epochs_in_columns_of_objects():
     read_years = read(stars(epoch=np.array(years, object))).epoch
     assert read_years == pytest.approx(2016.0, abs=2e-3)
     structures = np.array([{"a": 1.0}] * 6, object)
-    with pytest.raises(InputError, match=r"row 1, column 'epoch': .* is no date"):
+    with pytest.raises(InputError, match=r"row 1, column 'epoch': .* is not a date"):
         read(stars(epoch=structures))
 
 
@@ -218,7 +218,7 @@ def test_labels_of_every_type():
         assert m.exposure_names == ("7", "3", "9")
         assert m.exposure.tolist() == [0, 0, 1, 1, 0, 2]
     several = np.array([{"a": 1}, "b", "b", "b", "b", "b"], object)
-    with pytest.raises(InputError, match="row 1, column 'exposure': several values stand where"):
+    with pytest.raises(InputError, match="row 1, column 'exposure': there are several values"):
         read(stars(exposure=several))
 
 

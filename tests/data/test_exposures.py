@@ -80,8 +80,8 @@ def test_aberration_is_filled_in_only_where_it_is_missing():
 @pytest.mark.parametrize(
     ("columns", "message"),
     [
-        ({"exposure": ["a", "a"], "epoch": [2004.0, 2005.0]}, "exposure a stands twice"),
-        ({"exposure": ["a", "b"], "epoch": [2004.0, 1e5]}, r"row 2, column 'epoch': .* no year"),
+        ({"exposure": ["a", "a"], "epoch": [2004.0, 2005.0]}, "exposure a occurs twice"),
+        ({"exposure": ["a", "b"], "epoch": [2004.0, 1e5]}, r"row 2, column 'epoch': .* not a year"),
         ({"exposure": ["a", "b"]}, "no column for 'epoch'"),
         (
             {"exposure": ["a", "b"], "epoch": [2004.0, 2005.0], "vafactor": [1.0, 5.0]},
@@ -89,7 +89,7 @@ def test_aberration_is_filled_in_only_where_it_is_missing():
         ),
         (
             {"exposure": ["a", "b"], "epoch": [2004.0, 2005.0], "ra": ["", "east"]},
-            "row 2, column 'ra': 'east' stands where a number",
+            "row 2, column 'ra': 'east' is not a number",
         ),
     ],
 )

@@ -100,7 +100,7 @@ def test_exposures_are_drawn_whatever_their_order():
     ("aside", "words"),
     [
         (HoldoutSpec(0.1, ("z",)), "no exposure 'z'"),
-        (HoldoutSpec(0.0), "no star is set aside"),
+        (HoldoutSpec(0.0), "no star is held out"),
         (HoldoutSpec(0.0, NAMES), "none is left"),
     ],
 )
@@ -110,5 +110,5 @@ def test_what_makes_no_sense_is_refused(aside, words):
 
 
 def test_not_all_exposures_can_be_drawn():
-    with pytest.raises(InputError, match="4 exposures are to be held out, and there are 4"):
+    with pytest.raises(InputError, match="4 exposures are to be held out, but there are only 4"):
         exposures_drawn(NAMES, 4, 1)

@@ -28,7 +28,7 @@ def stars(n=6, **more):
 def test_numbers_without_names_are_refused(tmp_path):
     path = tmp_path / "stars.txt"
     path.write_text("1 2 3 4\n5 6 7 8\n")
-    with pytest.raises(InputError, match=r"stars\.txt: is of no known kind"):
+    with pytest.raises(InputError, match=r"stars\.txt: is of an unknown kind"):
         read_matches(path, sigma=1.0, unit="pix")
     path.write_text("# made by hand\n1 2 3 4\n5 6 7 8\n")  # three words, four columns
     assert not is_text_table(path.read_text().splitlines())

@@ -105,7 +105,7 @@ def test_what_cannot_be_estimated_is_refused(rng):
         estimate(mag[:5], *r[:, :5])
     with pytest.raises(InputError, match="no scatter"):
         estimate(mag, np.zeros(100), r[1])
-    with pytest.raises(InputError, match="beside 200 parameters"):
+    with pytest.raises(InputError, match="after fitting 200 parameters"):
         estimate(mag, *r, n_params=200)
     with pytest.raises(InputError, match="not finite"):
         estimate(np.where(mag < -9, np.nan, mag), *r)

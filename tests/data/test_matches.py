@@ -74,7 +74,7 @@ def test_quantities_are_converted():
     np.testing.assert_allclose(t.v, [0, 1e-3, 2e-3, 3e-3])
     np.testing.assert_allclose(t.sigma_u, 1e-3)
     np.testing.assert_allclose(t.pm_u, [0, 1e-3, 2e-3, 3e-3])
-    with pytest.raises(InputError, match="column 'x': unit mm cannot be brought to pix"):
+    with pytest.raises(InputError, match="column 'x': unit mm cannot be converted to pix"):
         table(x=k * apu.mm)
 
 

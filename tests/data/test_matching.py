@@ -77,7 +77,7 @@ def test_a_million_detections_in_seconds(rng, full):
 def test_another_field_is_refused_with_the_count(rng, n, with_mag):
     catalog, _, _, _, _ = field(rng, n)
     _, other, mag, _, _ = field(rng, n)
-    with pytest.raises(InputError, match=r"list\.xym: .* bring together \d+ stars, where chance"):
+    with pytest.raises(InputError, match=r"list\.xym: .* bring together \d+ stars, while chance"):
         match_to_catalog(*other.T, catalog, mag=mag if with_mag else None, source="list.xym")
 
 

@@ -94,10 +94,10 @@ def test_wrong_input(stars, tmp_path):
         read = read_matches if suffix == "ecsv" else open_matches
         with pytest.raises(InputError) as error:
             read(path, unit="arcsec")
-        assert "column 'v_nominal' is missing beside its partner; give nominal positions" in str(
+        assert "column 'v_nominal' is given without its partner; give nominal positions" in str(
             error.value
         )
-    with pytest.raises(InputError, match="column 'u_nominal' is missing beside its partner"):
+    with pytest.raises(InputError, match="column 'u_nominal' is given without its partner"):
         Matches([1.0], [1.0], [1.0], [1.0], v_nominal=[1.0])
     stars["v_nominal"][4] = np.nan
     stars.write(tmp_path / "nan.ecsv")

@@ -198,7 +198,7 @@ def test_where_errors_come_from(rng, tmp_path, monkeypatch):
             assert_bitwise(joined, getattr(theirs, name))
     with pytest.raises(InputError, match=r"a\.parquet: holds no errors"):
         open_matches(path)
-    with pytest.raises(InputError, match="sigma_v is -1, and must be"):
+    with pytest.raises(InputError, match="sigma_v is -1, but must be"):
         opened.with_errors((1, -1))
     path = write(tmp_path / "a.parquet", {k: bare[k] for k in "xyuv"})
     with pytest.raises(InputError, match=r"a\.parquet: holds no magnitudes"):
@@ -251,12 +251,12 @@ def test_what_takes_stars_in_memory_says_so(rng, tmp_path):
     opened = open_matches(write(tmp_path / "a.parquet", stars(rng)))
     one = np.full(500, 0.1)
     for call, message in (
-        (lambda: opened.x, "the stars are on disk, and no column 'x' of them is in memory"),
+        (lambda: opened.x, "the stars are on disk, so their column 'x' is not in memory"),
         (lambda: opened.epoch, "no column 'epoch'"),
         (lambda: opened.with_columns(x=one), "are on disk"),
-        (lambda: opened.select([1, 2]), "are selected by a mask"),
+        (lambda: opened.select([1, 2]), "can only be selected by a mask"),
         (lambda: opened.select(one > 1), "holds no rows"),
-        (lambda: opened.with_errors((one, one)), "errors of single stars are given"),
+        (lambda: opened.with_errors((one, one)), "errors of individual stars cannot be given"),
     ):
         with pytest.raises(InputError, match=message):
             call()
@@ -370,16 +370,16 @@ def planted(good, name, value):
 
 
 PLANTS = [
-    ("x", float("nan"), "value is nan, and must be finite"),
-    ("v", float("inf"), "value is inf, and must be finite"),
-    ("mag", float("nan"), "value is nan, and must be finite"),
-    ("su", 0.0, "sigma is 0, and must be positive"),
-    ("sv", -0.25, r"sigma is -0\.25, and must be positive"),
+    ("x", float("nan"), "value is nan, but must be finite"),
+    ("v", float("inf"), "value is inf, but must be finite"),
+    ("mag", float("nan"), "value is nan, but must be finite"),
+    ("su", 0.0, "sigma is 0, but must be positive"),
+    ("sv", -0.25, r"sigma is -0\.25, but must be positive"),
     ("u", None, "value is missing"),
     ("exp", None, "value is missing"),
-    ("y", "spam", "'spam' stands where a number must be"),
-    ("chip", 1.5, r"value is 1\.5, and must be a whole number"),
-    ("epoch", "spring", "'spring' is no date"),
+    ("y", "spam", "'spam' is not a number"),
+    ("chip", 1.5, r"value is 1\.5, but must be a whole number"),
+    ("epoch", "spring", "'spring' is not a date"),
 ]
 
 
@@ -473,15 +473,15 @@ def test_parts_that_do_not_fit_together(rng, tmp_path):
     write(tmp_path / "p2.parquet", {"x": [1.0], "y": [1.0]})
     with pytest.raises(InputError, match=r"p2\.parquet: no column for 'u'"):
         open_matches(tmp_path)
-    (tmp_path / "p2.parquet").write_bytes(b"this is no Parquet file")
+    (tmp_path / "p2.parquet").write_bytes(b"this is not a Parquet file")
     with pytest.raises(FormatError, match=r"p2\.parquet: cannot be read"):
         open_matches(tmp_path)
     (tmp_path / "a.csv").write_text("x,y\n")
-    with pytest.raises(FormatError, match=r"a\.csv: is no Parquet file.*read_matches"):
+    with pytest.raises(FormatError, match=r"a\.csv: is not a Parquet file.*read_matches"):
         open_matches(tmp_path / "a.csv")
     one_sigma = stars(rng)
     del one_sigma["sv"]
-    with pytest.raises(InputError, match="'sigma_v' is missing beside its partner"):
+    with pytest.raises(InputError, match="'sigma_v' is given without its partner"):
         open_matches(write(tmp_path / "s.parquet", one_sigma))
 
 

@@ -86,7 +86,7 @@ def test_a_wrong_field_is_refused_with_the_best_count(rng):
     uv, mag = positions(rng, 3000, 6000.0)
     other, other_mag = positions(rng, 3000, 6000.0)
     p, m, _ = frame(rng, other, other_mag, 1.0, np.array([3000.0, 3000.0]))
-    message = r"j1\.list: does not match cat: .* bring together \d+ stars, where chance gives"
+    message = r"j1\.list: does not match cat: .* bring together \d+ stars, while chance gives"
     with pytest.raises(InputError, match=message):
         find_similarity(p, pattern_index(uv, mag), mag=m, source="j1.list", reference_name="cat")
 

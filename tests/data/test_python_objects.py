@@ -292,7 +292,7 @@ def test_columns_beside_sky_coordinates():
     [
         ({"sky": 3}, "sky: is a int, not sky coordinates; give a SkyCoord"),
         ({"x": np.ones(3)}, r"y: has the shape \(40,\), and x has 3 values; give one value for"),
-        ({"sigma": 1 * u.pix}, "unit pix cannot be brought to arcsec"),
+        ({"sigma": 1 * u.pix}, "unit pix cannot be converted to arcsec"),
         ({"tangent_point": (1 * u.pix, 2.0)}, "tangent_point is given in pix"),
         ({"epoch": "yesterday"}, "epoch is 'yesterday', which is not a date"),
         ({"epoch": 3.0}, "epoch is 3, which is not a year"),

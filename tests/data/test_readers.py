@@ -138,7 +138,7 @@ def test_where_errors_come_from(stars, tmp_path):
 def test_what_is_wrong_with_paths_and_formats(stars, tmp_path):
     with pytest.raises(InputError, match=r"none\.fits: does not exist"):
         read_matches(tmp_path / "none.fits")
-    with pytest.raises(InputError, match="no file fits the pattern"):
+    with pytest.raises(InputError, match="no file matches the pattern"):
         read_matches(str(tmp_path / "*.fits"))
     with pytest.raises(InputError, match="no file is named"):
         read_matches([])
@@ -148,7 +148,7 @@ def test_what_is_wrong_with_paths_and_formats(stars, tmp_path):
     with pytest.raises(InputError, match="format is 'rvb'"):
         read_matches(tmp_path / "a.ecsv", format="rvb")
     (tmp_path / "a.txt").write_text("1 2 3\n")
-    with pytest.raises(FormatError, match="of no known kind"):
+    with pytest.raises(FormatError, match="of an unknown kind"):
         read_matches(tmp_path / "a.txt")
     with pytest.raises(InputError, match=r"extension '\.txt'"):
         read_matches(tmp_path / "a.txt", format="table")

@@ -294,7 +294,9 @@ def test_chips_and_exposures_have_a_wcs_of_their_own():
     named = both | {"exposure": np.repeat(["a", "b"], 700)}
     by_exposure = match(named, joint, radius=RADIUS, wcs={"a": wcs[1], "b": wcs[2]})
     np.testing.assert_array_equal(by_exposure.star, matches.star)
-    with pytest.raises(InputError, match="has 2 chips, and one WCS is given; give wcs as a mapp"):
+    with pytest.raises(
+        InputError, match="has 2 chips, but only one WCS is given; give wcs as a mapp"
+    ):
         match(both | {"chip": chip}, joint, radius=RADIUS, wcs=wcs[1])
     with pytest.raises(InputError, match="wcs has no key for chip 2"):
         match(both | {"chip": chip}, joint, radius=RADIUS, wcs={1: wcs[1]})
@@ -360,12 +362,12 @@ def test_wrong_input_is_one_sentence(case):
 def test_motions_need_both_epochs():
     seen, catalogue, _ = moving_field()
     options = {"radius": RADIUS, "wcs": tan_wcs(**ROUGH)}
-    with pytest.raises(InputError, match="has proper motions, and the epoch of the detections is"):
+    with pytest.raises(InputError, match="has proper motions, but the epoch of the detections is"):
         match(seen, catalogue, **options)
     still = {"pm_ra": "", "pm_dec": ""}
     assert len(match(seen, catalogue, **options, catalogue_columns=still)) > 0
     catalogue.remove_column("ref_epoch")
-    with pytest.raises(InputError, match="has proper motions, and the epoch of its positions is"):
+    with pytest.raises(InputError, match="has proper motions, but the epoch of its positions is"):
         match(seen, catalogue, **options, epoch=2024.0)
     assert len(match(seen, catalogue, **options, epoch=2024.0, catalogue_epoch=2016.0)) > 0
 

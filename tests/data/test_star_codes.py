@@ -62,7 +62,7 @@ def test_names_are_no_codes(tmp_path):
     Table({"x": [1.0], "y": [1.0], "u": [1.0], "v": [1.0], "star": ["HD 1"]}).write(
         tmp_path / "m.csv"
     )
-    with pytest.raises(InputError, match="row 1, column 'star': 'HD 1' stands where a number"):
+    with pytest.raises(InputError, match="row 1, column 'star': 'HD 1' is not a number"):
         read_matches(tmp_path / "m.csv", unit="pix", sigma=1.0)
     without = read_matches(tmp_path / "m.csv", columns={"star": ""}, unit="pix", sigma=1.0)
     assert without.star is None

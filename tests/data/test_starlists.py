@@ -69,10 +69,10 @@ def test_one_file_for_each_exposure(tmp_path):
     with pytest.raises(InputError, match=r"exposure j1 stands in .*j1\.csv, too"):
         read_star_lists([tmp_path / "j1.csv", tmp_path / "again.ecsv"])
     (tmp_path / "notes.txt").write_text("nothing\n")
-    with pytest.raises(InputError, match=r"notes\.txt: is of no known kind"):
+    with pytest.raises(InputError, match=r"notes\.txt: is of an unknown kind"):
         read_star_lists(tmp_path / "notes.txt")
     (tmp_path / "MATCHUP").write_text("# xbar ybar mbar xsig ysig msig\n1 2 3 4 5 6\n")
-    with pytest.raises(InputError, match=r"a catalogue \(matchup\), and star lists are asked for"):
+    with pytest.raises(InputError, match=r"a catalogue \(matchup\), but star lists are expected"):
         read_star_lists(tmp_path / "MATCHUP")
 
 
@@ -88,7 +88,7 @@ def test_pixels_that_count_from_zero_are_converted(tmp_path, caplog, names):
 
 @pytest.mark.parametrize(
     ("flux", "why"),
-    [([100.0, -1.0], "not all fluxes are positive"), (["a", "b"], "where a number must be")],
+    [([100.0, -1.0], "not all fluxes are positive"), (["a", "b"], "is not a number")],
 )
 def test_fluxes_that_make_no_magnitudes_are_named(tmp_path, caplog, flux, why):
     lists, matched = tmp_path / "j1.ecsv", tmp_path / "m.ecsv"
@@ -131,7 +131,9 @@ def test_errors_are_those_of_the_program(tmp_path, names, factor):
     with pytest.raises(InputError, match="no column for 'sigma_x'"):
         read_star_lists(tmp_path / "j3.ecsv", errors=True)
     (tmp_path / "j4.xym").write_text("1 2 -9\n")
-    with pytest.raises(InputError, match="has no errors of its pixels; have them measured"):
+    with pytest.raises(
+        InputError, match="has no errors of its pixels; set the errors to be measured"
+    ):
         read_star_lists(tmp_path / "j4.xym", errors=True)
 
 

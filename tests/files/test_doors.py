@@ -83,7 +83,7 @@ def test_a_sparse_file_is_not_read(tmp_path):
 
 def test_a_file_that_grows_while_it_is_read(tmp_path):
     (tmp_path / "a").write_bytes(b"x" * 100)
-    with pytest.raises(InputError, match="has 100 bytes, and at most 99 bytes are read"):
+    with pytest.raises(InputError, match="has 100 bytes, but at most 99 bytes are read"):
         regular.read_bytes(tmp_path / "a", most=99)
 
 

@@ -115,8 +115,8 @@ class Foreign:
 
 def test_classes_of_others_are_made_from_files_only_if_their_package_is_named():
     arrays = record_to_arrays(Foreign(1))
-    with pytest.raises(TypeError, match="no class of the records of bayesdist"):
+    with pytest.raises(TypeError, match="not a class of the records of bayesdist"):
         record_from_arrays(arrays)
-    with pytest.raises(TypeError, match="no class of the records of bayesdist, test"):
+    with pytest.raises(TypeError, match="not a class of the records of bayesdist, test"):
         record_from_arrays(arrays, packages=["test"])
     assert record_from_arrays(arrays, packages=["tests"]) == Foreign(1)

@@ -305,5 +305,5 @@ def test_errors_of_one_axis_alone_and_names_that_are_no_text(tmp_path):
     card = b"EXTNAME = 'WCSDVERR'"
     assert raw.count(card) == 2
     (tmp_path / "number.fits").write_bytes(raw.replace(card, b"EXTNAME = ".ljust(17) + b"606", 1))
-    with pytest.raises(FormatError, match=r"the name of HDU \d \(EXTNAME\) is no text"):
+    with pytest.raises(FormatError, match=r"the name of HDU \d \(EXTNAME\) is not text"):
         registry.read_calibration(tmp_path / "number.fits")

@@ -137,7 +137,7 @@ def test_a_list_without_its_columns_is_named(tmp_path):
     for name in ("MATCHUP.XYMEEE", "stars.lst"):
         path = tmp_path / name
         path.write_text("1 2 3 4 5 6\n")
-        with pytest.raises(FormatError, match="is of no known kind"):
+        with pytest.raises(FormatError, match="is of an unknown kind"):
             read_star_lists(path)
 
 

@@ -167,5 +167,5 @@ def test_the_closure_of_a_foreign_inverse_is_computed() -> None:
 def test_a_rough_maximum_is_a_note_with_numbers() -> None:
     """Spitzer's A_DMAX is 1.6 % high: no program computes with it."""
     text = describe(ASTROPY / "irac_sip.hdr")
-    assert "note: A_DMAX: says 0.58 px, and the maximum is 0.5708 px (+1.6 %)" in text
+    assert "note: A_DMAX: says 0.58 px, but the maximum is 0.5708 px (+1.6 %)" in text
     assert "warning" not in text

@@ -238,7 +238,7 @@ def test_a_file_of_the_data_model_is_read(tmp_path):
         ("parity", "error", "parity", "mirror image"),
         ("degrees", "error", "scale", "the transform gives degrees"),
         ("no units", "warning", "meta.input_units", "is missing"),
-        ("reftype", "error", "meta.reftype", "'specwcs', and not 'distortion'"),
+        ("reftype", "error", "meta.reftype", "'specwcs', not 'distortion'"),
         ("author", "warning", "meta.author", "asks for it"),
         ("copied", "warning", "c0_2, c1_1", "may have been copied"),
         ("closure", "error", "bayesdist.inverse", "states 1e-09 px"),
@@ -325,8 +325,8 @@ def test_a_changed_model_has_no_covariance(plain):
 @pytest.mark.parametrize(
     ("tree", "message"),
     [
-        ({"meta": META}, "holds meta, and not model and meta"),
-        ({"model": models.Identity(2)}, "holds model, and not model and meta"),
+        ({"meta": META}, "holds meta, instead of model and meta"),
+        ({"model": models.Identity(2)}, "holds model, instead of model and meta"),
         ({"meta": META, "x_model": 1, "y_model": 2}, "holds meta, x_model, y_model"),
         ({"meta": META, "model": [models.Identity(2)]}, "model holds a list of models"),
         ({"meta": META, "model": models.Identity(3)}, "takes 3 coordinates to 3"),
@@ -352,7 +352,7 @@ def test_a_transform_that_is_no_polynomial_is_described_and_not_applied(tabulate
     with pytest.raises(InputError, match="look-up tables are not arranged as bayesdist does"):
         document.calibration()
     tree["model"] = models.Rotation2D(3.0) | models.Gaussian1D() & models.Identity(1)
-    with pytest.raises(InputError, match="its transform is no polynomial"):
+    with pytest.raises(InputError, match="its transform is not a polynomial"):
         with_tree(tree).calibration()
 
 
@@ -361,7 +361,7 @@ def test_an_unknown_detector_needs_a_size():
         {"meta": META | {"instrument": {"name": "TFI"}}, "model": foreign_model(FOREIGN)}
     )
     assert "the detector is not known here" in document.describe()
-    with pytest.raises(InputError, match="does not say how large the image is"):
+    with pytest.raises(InputError, match="does not state the size of the image"):
         document.calibration()
     assert document.calibration(Choice(size=SIZE)).model.chips[0].size == SIZE
 
@@ -398,7 +398,7 @@ def test_tables_behind_the_polynomial_are_refused(plain):
 
 def test_a_record_of_another_version_is_refused(plain):
     record = tree_of(plain[1])["bayesdist"] | {"version": 99}
-    with pytest.raises(FormatError, match="version 99, and 1 is read here"):
+    with pytest.raises(FormatError, match="version 99, but this version of bayesdist reads 1"):
         calibration_from(record, "a file")
 
 

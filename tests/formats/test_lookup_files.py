@@ -226,7 +226,7 @@ def test_the_cards_say_what_the_user_knows(rng, tmp_path) -> None:
 def test_tables_that_do_not_belong_into_the_file(rng, tmp_path, turned) -> None:
     path = tmp_path / "x.fits"
     cases = [
-        (InputError, "is not the detector's", lambda: write_d2im([table(1, rng, "F606W")], path)),
+        (InputError, "table of the detector", lambda: write_d2im([table(1, rng, "F606W")], path)),
         (InputError, "no look-up table is given", lambda: write_d2im([], path)),
         (InputError, "2 look-up tables of chip 1", lambda: write_d2im([table(1, rng)] * 2, path)),
         (InputError, "is not of F606W CLEAR2L, filter F606W",

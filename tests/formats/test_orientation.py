@@ -367,7 +367,7 @@ def test_the_bound_of_the_report_by_hand(turned) -> None:
 def test_more_than_the_limit_is_refused(truth, turned) -> None:
     with pytest.raises(InputError, match=r"cannot store drifts of WFC2.*\(u, 0, 1\) with 0.032"):
         storable(turned, years=(2002.2, 2009.4), limit_mas=0.03)
-    with pytest.raises(InputError, match=r"years 2009\.0 to 2002.0 do not rise"):
+    with pytest.raises(InputError, match=r"years 2009\.0 to 2002.0 are not ascending"):
         storable(turned, years=(2009.0, 2002.0))
     with pytest.raises(InputError, match="orient the solution first"):
         storable(calibration_of(truth), years=(2002.0, 2009.0))

@@ -178,7 +178,7 @@ def loosely(document):
 @pytest.mark.parametrize(
     ("tree", "message"),
     [
-        ({"roman": {"meta": {"a": 1}}}, f"holds meta under roman, and not meta and {KEY}"),
+        ({"roman": {"meta": {"a": 1}}}, f"holds meta under roman, instead of meta and {KEY}"),
         ({"roman": {"meta": {}, "data": [1]}}, "holds data, meta under roman"),
         ({"roman": {"meta": {}, KEY: "x"}}, f"{KEY} holds no model"),
         ({"roman": {"meta": {}, KEY: models.Identity(3)}}, "takes 3 coordinates to 3"),

@@ -339,7 +339,7 @@ def test_an_unknown_aperture_needs_a_size(calibration):
     )
     document = registry.recognized(Content("table.txt", text.encode()))
     assert "size of the detector is not known" in document.describe()
-    with pytest.raises(InputError, match="MADE_UP is no full frame that is known here"):
+    with pytest.raises(InputError, match="MADE_UP is not a known full frame"):
         document.calibration()
     assert document.calibration(Choice(size=SIZE)).model.chips[0].size == SIZE
 
@@ -350,7 +350,7 @@ def test_a_subarray_is_not_taken_for_the_full_frame(data_dir):
     from .siaf_aperture import pysiaf_offline
 
     document = registry.open_document(data_dir / "reports" / "siaf_NRCA5_SUB320.txt")
-    with pytest.raises(InputError, match=r"NRCA5_SUB320 is no full frame.*--size"):
+    with pytest.raises(InputError, match=r"NRCA5_SUB320 is not a known full frame.*--size"):
         document.calibration()
     found = document.calibration(Choice(size=(320.0, 320.0)))
     assert found.model.chips[0].size == (320.0, 320.0)
@@ -379,7 +379,7 @@ def test_full_frames_have_the_size_and_reference_pixel_of_pysiaf():
 def test_a_size_that_is_not_that_of_the_aperture_is_refused(written):
     document = registry.open_document(written[0])
     assert document.calibration(Choice(size=SIZE)).model.chips[0].size == SIZE
-    with pytest.raises(InputError, match="has 2048 x 2048 pixels, and 320 x 320 are given"):
+    with pytest.raises(InputError, match="has 2048 x 2048 pixels, but 320 x 320 are given"):
         document.calibration(Choice(size=(320.0, 320.0)))
 
 

@@ -96,7 +96,7 @@ def test_constant_and_linear_terms_that_are_asked_for_are_noted(tmp_path):
 
 
 def test_axes_of_the_sky_are_not_linear(fit, tmp_path):
-    with pytest.raises(InputError, match="leave axes out"):
+    with pytest.raises(InputError, match="leave out axes"):
         made(fit, tmp_path, axes="linear", crval=(1.0, 2.0))
 
 
@@ -123,7 +123,7 @@ def test_parameters_beside_a_header_have_the_covariance(fit, tmp_path):
     card = next(line for line in text.splitlines() if line.startswith("CD1_1"))
     value = float(card[10:].split("/")[0])
     (tmp_path / "sip.hdr").write_text(text.replace(card, f"CD1_1   = {value * (1 + 1e-5):.15E}"))
-    with pytest.raises(InputError, match="one of the two was changed"):
+    with pytest.raises(InputError, match="one was changed"):
         read_calibration(tmp_path / "sip.hdr")
     (tmp_path / "sip.hdr").write_text(text)
     (tmp_path / "sip_parameters.fits").unlink()

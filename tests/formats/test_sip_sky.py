@@ -136,8 +136,8 @@ def test_it_comes_back_from_a_file(tmp_path) -> None:
 @pytest.mark.parametrize(
     ("unit", "options", "message"),
     [
-        ("pix", {}, "tangent point is given beside u, v in pixels"),
-        ("arcsec", {"origin": (0.0, 0.0)}, "tangent point is given beside"),
+        ("pix", {}, "tangent point is given together with u, v in pixels"),
+        ("arcsec", {"origin": (0.0, 0.0)}, "tangent point is given together with"),
         ("arcsec", {"crval": (200.0, -30.0)}, "90 degrees or more"),
         ("arcsec", {"crval": (20.0, 95.0)}, "not a right ascension and declination"),
         ("arcsec", {"crval": (20.0, float("nan"))}, "not a right ascension and declination"),

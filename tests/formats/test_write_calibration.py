@@ -252,7 +252,7 @@ IN_PIXELS = calibration_of(some_solution(4), "camera")
         ("tpv", {"scale_mas": "big"}, "scale_mas is 'big', which is not a number"),
         ("tpv", {"scale_mas": 50, "order": 9}, "order: the order is 9; choose one from 1 to 7"),
         ("tpv", {"scale_mas": 50, "epoch": np.nan}, "epoch is nan, which is not a year"),
-        ("wise_meta", {}, "no band of WISE"),
+        ("wise_meta", {}, "not a band of WISE"),
     ],
 )  # fmt: skip
 def test_bad_requests_get_one_sentence(tmp_path, format, settings, message):
@@ -290,7 +290,7 @@ def test_a_header_without_its_size_asks_for_it(tmp_path):
     lines = path.read_text().splitlines()
     kept = [line for line in lines if not line.startswith(("NAXIS", "IMAGE"))]
     path.write_text("\n".join(kept) + "\n")
-    with pytest.raises(bd.InputError, match=r"how large the image is; give it \(size=\(NX, NY\)"):
+    with pytest.raises(bd.InputError, match=r"the size of the image; give it \(size=\(NX, NY\)"):
         bd.read_calibration(path)
     assert bd.read_calibration(path, size=(1200, 900)).plane.point is not None
     assert distances(on_sky(4), bd.read_calibration(path, size=(1200, 900))).max() < 1e-4

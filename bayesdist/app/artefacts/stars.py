@@ -214,7 +214,8 @@ def set_aside(
     split = split_matches(matches, HoldoutSpec(block.fraction, held_exposures, config.sampler.seed))
     if not HELD_OUT.met_by(len(split.held)):
         raise InputError(
-            f"{len(split.held)} of {len(matches)} stars are held out, which say too little",
+            f"{len(split.held)} of {len(matches)} stars are held out, too few to judge the "
+            "solution",
             where=", ".join(matches.sources),
             do=f"hold out at least {HELD_OUT.value}: raise holdout.fraction",
         )
@@ -230,7 +231,7 @@ def _whole_exposures(
     for name in block.exposures:
         if name in names[:needed]:
             raise InputError(
-                f"exposure {name!r} is to be held out, and defines the gauge",
+                f"exposure {name!r} is to be held out, but it defines the gauge",
                 where="holdout.exposures",
                 do="name another one",
             )

@@ -45,7 +45,7 @@ def check_pairs(raw: Matches, config: Config) -> dict[str, int]:
             years = [epoch.min(), epoch.max(), start, stop]
             first, last, begin, end = Time(years, format="decimalyear", scale="tt").mjd
             raise InputError(
-                f"the period about MJD {name} has no pairs: they go from MJD {first:.3f} to "
+                f"the period about MJD {name} has no pairs: the pairs span MJD {first:.3f} to "
                 f"{last:.3f}, and it from {begin:.3f} to {end:.3f}",
                 where=files,
                 do="correct periods.centres and periods.days, or leave the period out",

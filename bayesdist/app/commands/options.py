@@ -82,7 +82,9 @@ class LazyGroup(click.Group):
     def checked(command: object, where: str) -> click.Command:
         """Return the command; InputError if the object is none."""
         if not isinstance(command, click.Command):
-            raise InputError("is no command", where=where, do="mend the package that names it")
+            raise InputError(
+                "is not a command", where=where, do="correct the package that registers it"
+            )
         return command
 
 
@@ -117,7 +119,9 @@ class _ColumnNames(click.ParamType):
         for key, mark, _ in pairs:
             if not mark or not key.strip():
                 raise InputError(
-                    f"{key!r} is not KEY=NAME", where="--columns", do="write it so, as x=XWIN_IMAGE"
+                    f"{key!r} is not KEY=NAME",
+                    where="--columns",
+                    do="write it in that form, as in x=XWIN_IMAGE",
                 )
         return {key.strip(): name.strip() for key, _, name in pairs}
 

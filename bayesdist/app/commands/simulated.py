@@ -31,7 +31,9 @@ def camera(output: str, stars: int, seed: int, force: bool) -> None:
     from bayesdist.simulate.matches import matched_to_gaia
 
     if Path(output).exists() and not force:
-        raise InputError("is there already", where=output, do="choose another name, or --force")
+        raise InputError(
+            "already exists", where=output, do="choose another name, or replace it with --force"
+        )
     table = matched_to_gaia(stars, np.random.default_rng(seed))
     with atomic_path(output) as path:
         table.write(path, format="ascii.csv", overwrite=True)

@@ -97,17 +97,17 @@ class BudgetBlock(Section):
         if self.kind not in TERM_KINDS:
             if self.sigma is None or not neither:
                 yield (
-                    f"{of_kind} one sigma; give sigma, in the unit of its kind, and neither "
-                    "sigma_u nor sigma_v"
+                    f"{of_kind} a single sigma; give sigma, in the unit of its kind, instead of "
+                    "sigma_u and sigma_v"
                 )
             if self.unit is not None:
-                yield f"{of_kind} a unit of its own, and unit is {self.unit!r}; leave unit out"
+                yield f"{of_kind} a fixed unit, but unit is {self.unit!r}; leave out unit"
         elif not axes or self.sigma is not None:
-            yield f"{of_kind} a sigma on each axis; give sigma_u and sigma_v, and no sigma"
+            yield f"{of_kind} one sigma per axis; give sigma_u and sigma_v instead of sigma"
         if self.included_in_scatter and self.kind != "random":
             yield (
-                "included_in_scatter is of a random budget term, which scatters from star to star; "
-                "leave it out"
+                "included_in_scatter applies only to random budget terms, which vary from star to "
+                "star; leave it out"
             )
 
 

@@ -25,7 +25,7 @@ class HoldoutBlock(Section):
     def faults(self) -> Iterator[str]:
         """Fault of a section that holds nothing out."""
         if not self.fraction and not self.exposures:
-            yield "[holdout] sets nothing aside; give a fraction of the stars, or exposures"
+            yield "[holdout] holds nothing out; give a fraction of the stars, or exposures"
 
 
 class Periods(Section):
@@ -101,8 +101,8 @@ class Outliers(MixtureOutliers):
         """Fault of jitters for groups when a single jitter is given."""
         if self.jitter_by not in ("auto", "one") and self.jitter != "fit":
             yield (
-                f"outliers.jitter_by is {self.jitter_by!r}, and outliers.jitter gives the one "
-                "jitter of all stars; leave one of the two out"
+                f"outliers.jitter_by is {self.jitter_by!r}, but outliers.jitter gives a single "
+                "jitter for all stars; leave one of the two out"
             )
 
 
@@ -143,17 +143,18 @@ class ComputeBlock(Section):
             if self.engine != "dask" and getattr(self, key) is not None:
                 yield (
                     f"compute.{key} is given, but compute.engine is {self.engine!r}; set the "
-                    f"engine to 'dask', or leave {key} out"
+                    f"engine to 'dask', or leave out {key}"
                 )
         if self.scheduler is not None and self.workers is not None:
             yield (
-                "compute.workers is given, but the cluster of compute.scheduler has its own; "
-                "leave one of the two out"
+                "compute.workers is given, but the cluster of compute.scheduler has its workers "
+                "already; leave one of the two out"
             )
         if self.scratch is not None and not Path(self.scratch).is_absolute():
             yield (
-                f"compute.scratch is {self.scratch!r}, which is another folder for each program; "
-                "give its absolute path, the same for this program and all workers"
+                f"compute.scratch is {self.scratch!r}, which each program would resolve to a "
+                "different folder; give its absolute path, the same for this program and all "
+                "workers"
             )
 
     def resources(self) -> Compute:

@@ -20,9 +20,7 @@ _USEAFTER = ("%b %d %Y %H:%M:%S", "%b %d %Y")  # as in reference files of HST
 def _as_part(name: str) -> str:
     """Validate a part of a file name, which must not lead to another folder."""
     if not name or not name.isprintable() or {*name} & {*"/\\"}:
-        raise ValueError(
-            f"{name!r} cannot be part of the name of a file; give letters without slashes"
-        )
+        raise ValueError(f"{name!r} cannot be part of a file name; give letters without slashes")
     return name
 
 

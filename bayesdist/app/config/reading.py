@@ -257,7 +257,7 @@ def _settings(text: str, where: str, *, begin: str) -> dict[str, Any]:
         if abs(value) > large or 0 < abs(value) < LEAST:
             number = str(value) if len(str(value)) < 30 else f"{str(value)[:20]}..."
             raise ConfigError(
-                f"{number} is no plausible number",
+                f"{number} is not a plausible number",
                 where=f"{where}: {key}",
                 do=f"give one between {LEAST:g} and {large:g}",
             )

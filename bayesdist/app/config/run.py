@@ -118,8 +118,8 @@ class RunConfig(Section):
         reserved = next((b.name for b in self.budget if b.name in MEASURED_TERMS), None)
         if reserved is not None:
             yield (
-                f"a [[budget]] block has the name {reserved!r}, which is that of a measured row; "
-                "give it another"
+                f"a [[budget]] block has the name {reserved!r}, which is reserved for a measured "
+                "row; give it another name"
             )
         twice = next((b.name for b in self.budget if b.of_catalogue and b.stated), None)
         if self.catalogue is not None and twice is not None:
@@ -130,8 +130,8 @@ class RunConfig(Section):
         yield from detector_faults(self.chip, self.detector, self.model.reference_pixel)
         if self.chip and self.detector.field is not None:
             yield (
-                "detector.field is of a detector of one chip, and there are [[chip]] blocks; leave "
-                "it out, and give each requirement the region of its chip"
+                "detector.field applies to a detector with a single chip, but there are [[chip]] "
+                "blocks; leave it out, and give each requirement the region of its chip"
             )
         yield from self._field_faults()
         for settings in self.products.asked().values():

@@ -80,13 +80,12 @@ def detector_faults(
 ) -> Iterator[str]:
     """Faults of contradictory chips, and of a missing detector."""
     if sum(c.reference for c in chips) > 1:
-        yield "reference = true stands in several [[chip]] blocks; keep it in one"
+        yield "reference = true occurs in several [[chip]] blocks; keep it in one"
     for key in ("number", "name"):
         yield from same_names("chip", [getattr(c, key) for c in chips], key)
     if chips and (detector.size or reference_pixel):
         yield (
-            "[[chip]] blocks stand in place of detector.size and model.reference_pixel; "
-            "give one of the two"
+            "[[chip]] blocks replace detector.size and model.reference_pixel; give one or the other"
         )
     if not chips and detector.size is None:
         yield "detector.size is missing; give it, or [[chip]] blocks"
@@ -96,7 +95,7 @@ def same_names(block: str, names: Sequence[object], key: str = "name") -> Iterat
     """Fault of blocks with equal names, or equal values of another unique key."""
     duplicate = next((name for name, n in Counter(names).items() if n > 1), None)
     if duplicate is not None:
-        yield f"two [[{block}]] blocks have the {key} {duplicate!r}; give each its own"
+        yield f"two [[{block}]] blocks have the {key} {duplicate!r}; give each a different one"
 
 
 def reference_first(chips: Sequence[Block]) -> list[Block]:

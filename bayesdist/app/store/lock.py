@@ -69,7 +69,7 @@ def _acquired(path: Path) -> int:
             holder = _read(held)
             os.close(held)
             raise InputError(
-                f"another process is at work on this run{holder and f' ({holder})'}",
+                f"another process is using this run{holder and f' ({holder})'}",
                 where=str(path.parent),
                 do="wait until it has ended, or choose another folder",
             ) from error

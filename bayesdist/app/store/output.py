@@ -21,7 +21,7 @@ from bayesdist.infer import Posterior
 def refuse_existing(path: Path, force: bool) -> None:
     """Refuse a file that exists, unless it may be replaced."""
     if path.exists() and not force:
-        raise InputError("this file exists", where=str(path), do="replace it by --force")
+        raise InputError("this file exists", where=str(path), do="replace it with --force")
 
 
 def write_table(table: Table, path: Path) -> None:
@@ -60,7 +60,7 @@ def atomic_directory(path: Path) -> Iterator[Path]:
         raise InputError(
             "the folder holds other files" if path.is_dir() else "is a file, not a folder",
             where=str(path),
-            do="choose a new folder: what is there is never overwritten",
+            do="choose a new folder: existing files are never overwritten",
         )
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -182,8 +182,8 @@ class Record:
         head = model_of(_HEAD, facts, str(path), do=do)
         if head.schema_ != SCHEMA:
             raise InputError(
-                f"is a run of schema {head.schema_}, which the bayesdist that made it "
-                f"({head.versions.get('bayesdist', 'another version')}) reads, and this one reads "
+                f"is a run of schema {head.schema_}, which the version of bayesdist that made it "
+                f"({head.versions.get('bayesdist', 'another version')}) reads; this version reads "
                 f"schema {SCHEMA}",
                 where=str(path),
                 do="use that version, or choose another folder",
@@ -191,7 +191,7 @@ class Record:
         content = model_of(_WHOLE, facts, str(path), do=do)
         if facts.pop("sha256") != digest_of_plain(facts):
             raise InputError(
-                "was changed since bayesdist wrote it (its checksum is another)",
+                "was changed since bayesdist wrote it (its checksum differs)",
                 where=str(path),
                 do=do,
             )

@@ -77,16 +77,17 @@ def refuse_another_solution(
     path = folder / "config.toml"
     if seed is not None and seed != known.sampler.seed:
         raise InputError(
-            f"the run began with seed {known.sampler.seed}",
+            f"the run was started with seed {known.sampler.seed}",
             where=str(folder),
-            do="leave --seed out, or start again with --force",
+            do="leave out --seed, or start again with --force",
         )
     if path.exists():  # the seed of the file may have been replaced on the command line
         known = with_seed(known, parse_config(load_text(path), str(path)).sampler.seed)
     for key, old, new in changes(known, config):
         if not is_adjustable(key, known):
             raise InputError(
-                f"the configuration has {key} = {shown(new)}, and this run began with {shown(old)}",
+                f"the configuration has {key} = {shown(new)}, but this run was started with "
+                f"{shown(old)}",
                 where=str(path),
                 do="resume with the old value, or start again with --force",
             )
@@ -108,7 +109,7 @@ def refuse_edited(folder: Path, known: Config) -> None:
         resumed = f"take it over by 'bayesdist run {path} -o {folder} --resume'"
         adjustable = all(is_adjustable(key, known) for key in keys)
         raise InputError(
-            f"was edited since the run began ({keys[0]}), which goes by the old one",
+            f"was edited since the run began ({keys[0]}), which uses the old one",
             where=str(path),
             do=f"restore it, or {resumed if adjustable else 'start again with --force'}",
         )

@@ -363,7 +363,8 @@ class RunDirectory(ArtefactStore):
             self.refuse_damaged(earlier)
             if not self.done(earlier):
                 raise InputError(
-                    f"'{stage}' needs stage '{earlier}', which was made from something else",
+                    f"'{stage}' needs stage '{earlier}', which was made from other inputs or "
+                    "settings",
                     where=str(self.path),
                     do=f"{do} again",
                 )

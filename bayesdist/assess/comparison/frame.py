@@ -115,7 +115,7 @@ def common_frame(a: ChipMap, b: ChipMap, *, keep: bool) -> CommonFrame:
     lies_alike = same_unit and not mirrored and abs(turn - 1.0) < NEAR
     if keep and not lies_alike:
         raise InputError(
-            "shift, rotation and scale are no difference between frames "
+            "shift, rotation and scale are not meaningful differences between frames "
             + ("of other axes" if same_unit else f"in {a.unit} and in {b.unit}"),
             where=f"{a.name}, {b.name}",
             do="leave out --keep-linear",

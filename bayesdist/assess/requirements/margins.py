@@ -343,7 +343,7 @@ def domains_of(
     if r.epochs is not None:
         if model.time is None:
             raise InputError(
-                "it names a range of epochs, and the model does not depend on time",
+                "it names a range of epochs, but the model does not depend on time",
                 where=r.where,
                 do="leave epochs out, or give the model time-dependent terms",
             )
@@ -354,14 +354,14 @@ def domains_of(
         epochs = [*sorted({*np.linspace(start, stop, EPOCHS).tolist(), *inner, *before})]
     elif epochs[0] is None and model.time is not None:
         raise InputError(
-            "the model depends on time and no epoch is given",
+            "the model depends on time, but no epoch is given",
             where=r.where,
             do="give the requirement an epoch, or set assess.epoch",
         )
     chips = _chips_of(r, model, chip, epochs[0])
     if not isinstance(r.region, str) and len(chips) > 1:
         raise InputError(
-            "a polygon lies on one chip, and all chips are judged",
+            "a polygon lies on one chip, but all chips are judged",
             where=r.where,
             do=f"name its chip, one of {', '.join(str(c.number) for c in chips)}",
         )
@@ -398,8 +398,8 @@ def _chips_of(
         raise InputError(
             f"there is no chip {number}",
             where=requirement.where,
-            do=f"name one of {', '.join(str(c.number) for c in model.chips)}, or leave chip out "
-            "for all of them",
+            do=f"name one of {', '.join(str(c.number) for c in model.chips)}, or leave out chip to "
+            "judge all of them",
         )
     if number is None:
         return model.chips

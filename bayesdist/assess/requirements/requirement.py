@@ -214,7 +214,7 @@ def as_requirements(requirements: Requirement | Sequence[Requirement]) -> list[R
     for requirement in several:
         if not isinstance(requirement, Requirement):
             raise InputError(
-                f"{requirement!r} is no requirement",
+                f"{requirement!r} is not a requirement",
                 where="requirements",
                 do="give bayesdist.Requirement(name, statistic, limit)",
             )

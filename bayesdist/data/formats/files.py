@@ -126,7 +126,7 @@ def _expanded(path: Path) -> list[Path]:
         return [path]
     matching_files = sorted(Path(file) for file in glob.glob(str(path), recursive=True))  # noqa: PTH207  from any root
     if not matching_files:
-        raise InputError("no file fits the pattern", where=str(path), do="check the pattern")
+        raise InputError("no file matches the pattern", where=str(path), do="check the pattern")
     return matching_files
 
 
@@ -155,7 +155,7 @@ def kind_of(file: Path, columns: Mapping[str, str] | None) -> str:
     if is_text_table(lines) or is_fits(file):
         return "table"
     raise FormatError(
-        "is of no known kind",
+        "is of an unknown kind",
         where=str(file),
         do="name its columns in its first line, or give a file that ends in "
         + ", ".join(TABLE_SUFFIXES),

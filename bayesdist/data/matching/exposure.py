@@ -155,8 +155,8 @@ def match_exposure(
     false_fraction = float(np.clip(1.0 - true / len(index), 0.0, 1.0))
     if radius is None and false_fraction > _MAX_FALSE_FRACTION:
         raise InputError(
-            f"of {len(index)} pairs with {catalog.source} {false_fraction:.0%} are there by "
-            "chance: they do not crowd near zero distance",
+            f"of {len(index)} pairs with {catalog.source} {false_fraction:.0%} are chance "
+            "coincidences: their distances do not cluster near zero",
             where=source,
             do="give a better known distortion, or a search radius",
         )

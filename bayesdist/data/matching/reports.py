@@ -117,7 +117,7 @@ def check_campaign(
             )
         if stars.name in names[:k]:
             raise InputError(
-                f"exposure {stars.name} has a list in {lists[names.index(stars.name)].source}, too",
+                f"exposure {stars.name} also has a list in {lists[names.index(stars.name)].source}",
                 where=stars.source,
                 do="give one list for each exposure",
             )
@@ -143,7 +143,7 @@ def all_cut(stars: Detections, rejected: Mapping[str, int]) -> InputError:
     return InputError(
         f"the cuts leave none of {len(stars)} detections ({counts})",
         where=stars.where,
-        do="widen the cuts, or correct the columns that they go by",
+        do="widen the cuts, or correct the columns that they use",
     )
 
 
@@ -190,7 +190,7 @@ def refuse_astray(reports: Sequence[ExposureReport], catalog: ReferenceCatalog) 
         + ", ".join(f"{n} matched on chip {chip}" for chip, n in first.per_chip.items())
         + ")",
         where=catalog.source,
-        do="check the chip numbers, and where the known distortion puts that chip",
+        do="check the chip numbers, and the position of that chip in the known distortion",
     )
 
 

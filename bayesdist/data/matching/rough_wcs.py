@@ -213,9 +213,9 @@ class _Stars:
             return sky_columns(self.columns)
         if epoch is None:
             raise InputError(
-                "has proper motions, and the epoch of the detections is not given",
+                "has proper motions, but the epoch of the detections is not given",
                 where=CATALOGUE,
-                do="give epoch, or leave the motions out: "
+                do="give epoch, or leave out the motions: "
                 'catalogue_columns={"pm_ra": "", "pm_dec": ""}',
             )
         dates = np.full(len(self.rows), epoch)
@@ -348,9 +348,9 @@ def _reference(
     moving = "pm_ra" in column_names
     if moving and "catalogue_epoch" not in column_names and epoch is None:
         raise InputError(
-            "has proper motions, and the epoch of its positions is not given",
+            "has proper motions, but the epoch of its positions is not given",
             where=CATALOGUE,
-            do="give catalogue_epoch, or leave the motions out: "
+            do="give catalogue_epoch, or leave out the motions: "
             'catalogue_columns={"pm_ra": "", "pm_dec": ""}',
         )
     of_motions: tuple[str, ...] = ()
@@ -471,7 +471,7 @@ def _epochs(
     """Epochs (N,) of the detections: from the option, the column, or the header."""
     if options.epoch is not None and "epoch" in quantities:
         raise InputError(
-            "an epoch of the exposures is given, and the table has a column of it",
+            "an epoch of the exposures is given, but the table also has an epoch column",
             where=quantities["epoch"].where,
             do='leave one of them out (columns={"epoch": ""})',
         )
@@ -503,7 +503,7 @@ def _by_wcs(
     if not isinstance(wcs, Mapping) or hasattr(wcs, "cards"):  # a FITS header is a mapping as well
         if len(codes["chip"][1]) > 1:
             raise InputError(
-                f"has {len(codes['chip'][1])} chips, and one WCS is given",
+                f"has {len(codes['chip'][1])} chips, but only one WCS is given",
                 where=DETECTIONS,
                 do="give wcs as a mapping from chip number to WCS",
             )

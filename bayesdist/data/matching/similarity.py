@@ -134,7 +134,7 @@ def pattern_index(positions: ArrayLike, mag: ArrayLike | None = None) -> Pattern
     points = np.ascontiguousarray(positions, np.float64)
     if len(points) < 3 or not np.isfinite(points).all():
         raise InputError(
-            "positions are fewer than three, or not all finite",
+            "there are fewer than three positions, or some are not finite",
             where="reference list",
             do="give more stars",
         )
@@ -193,11 +193,13 @@ def find_similarity(
     xy = np.ascontiguousarray(points, np.float64)
     if len(xy) < 3 or not np.isfinite(xy).all():
         raise InputError(
-            "positions are fewer than three, or not all finite", where=source, do="give more stars"
+            "there are fewer than three positions, or some are not finite",
+            where=source,
+            do="give more stars",
         )
     if not 0.0 < scale[0] < scale[1]:
         raise InputError(
-            f"scales from {scale[0]} to {scale[1]} are none", where=source, do="give a range"
+            f"scales from {scale[0]} to {scale[1]} are not a range", where=source, do="give a range"
         )
     order = np.arange(len(xy))
     if mag is not None:
@@ -232,7 +234,7 @@ def find_similarity(
                 )
     raise InputError(
         f"does not match {reference_name}: the best rotation and shift bring together {best[0]} "
-        f"stars, where chance gives {best[1]:.1f}",
+        f"stars, while chance gives {best[1]:.1f}",
         where=source,
         do="check the field, the scale, the parity and the distortion that is taken as known",
     )
@@ -324,7 +326,7 @@ def mismatch_reason(plane: Float, mag: Float | None, reference: PatternIndex) ->
         at = "" if as_it_is else f" at {scale:.4g} times the scale"
         best = sigmas
         reason = (
-            f"{image} does match{at}: {similarity.found} stars, where chance gives "
+            f"{image} does match{at}: {similarity.found} stars, while chance gives "
             f"{similarity.expected:.1f}"
         )
         if best > _CLEAR_SIGMAS:

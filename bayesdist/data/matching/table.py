@@ -114,7 +114,9 @@ def match_to_catalog(
     reference = np.column_stack([catalog.u, catalog.v])
     if not len(points) or not np.isfinite(points).all():
         raise InputError(
-            "positions to match are none, or not all finite", where=source, do="correct the list"
+            "there are no positions to match, or some are not finite",
+            where=source,
+            do="correct the list",
         )
     if radius is not None and not radius > 0:
         raise InputError(f"match radius is {radius}", where=source, do="give a positive radius")
@@ -210,11 +212,11 @@ def match_table(
         raise InputError(
             f"positions are in {table.unit}, those of {catalog.source} in {catalog.unit}",
             where=location,
-            do="bring both to one unit",
+            do="convert both to one unit",
         )
     if catalog.pm_u is not None and table.epoch is None:
         raise InputError(
-            f"has no epoch, and {catalog.source} has proper motions",
+            f"has no epoch, but {catalog.source} has proper motions",
             where=location,
             do="give the epoch of the exposures",
         )

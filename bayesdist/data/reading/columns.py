@@ -259,7 +259,7 @@ def match_columns(quantities: Quantities, options: ReadOptions) -> dict[str, Any
     if "epoch" in present:
         if options.epoch is not None:
             raise InputError(
-                "an epoch of the exposures is given, and the table has a column of it",
+                "an epoch of the exposures is given, but the table also has an epoch column",
                 where=column("epoch").where,
                 do='leave one of them out (columns = {epoch = ""})',
             )
@@ -311,7 +311,7 @@ def _pixels(column: SourceColumn, pixel_origin: int | None) -> Float:
         )
     if column.unit is not None and str(column.unit) != "pix":
         raise InputError(
-            f"unit is {column.unit}, and detector positions are in pix",
+            f"unit is {column.unit}, but detector positions are in pix",
             where=column.where,
             do="name the columns of raw pixels",
         )
@@ -391,13 +391,13 @@ def _sigma(column: SourceColumn, unit: str) -> Float:
         bad = int(np.argmin(good))
         if not sigma.any():
             raise InputError(
-                "sigma is 0 in all rows, and must be positive",
+                "sigma is 0 in all rows, but must be positive",
                 where=column.where,
                 do="leave the column out and set data.sigma to a number, or to 'by_magnitude'; "
                 "positions that were computed, as those of a design, have no errors to calibrate: "
                 "fit them by bayesdist.fit_linear with sigma = 1",
             )
-        raise column.fail(bad, f"sigma is {sigma[bad]:g}, and must be positive")
+        raise column.fail(bad, f"sigma is {sigma[bad]:g}, but must be positive")
     return sigma
 
 
@@ -414,7 +414,7 @@ def _correlation(quantities: Quantities) -> Float:
     beyond = ~(np.abs(rho) <= LARGEST_RHO)
     if beyond.any():
         bad = int(np.argmax(beyond))
-        raise column.fail(bad, f"a correlation is {rho[bad]:g}, and must be {LARGEST_RHO} at most")
+        raise column.fail(bad, f"a correlation is {rho[bad]:g}, but must be {LARGEST_RHO} at most")
     return rho
 
 

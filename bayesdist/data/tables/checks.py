@@ -112,7 +112,7 @@ def check_values(
             elif 0 < values[bad] <= SMALLEST:
                 must = f"above {SMALLEST:g}"
             raise InputError(
-                f"value is {values[bad]:g}, and must be {must}",
+                f"value is {values[bad]:g}, but must be {must}",
                 where=f"{place(bad)}, column {name!r}",
                 do="correct the row or drop it",
             )
@@ -123,7 +123,7 @@ def refuse_half(pair: tuple[str, str], present: Container[str], *, where: str, w
     for name, partner in (pair, pair[::-1]):
         if partner in present and name not in present:
             raise InputError(
-                f"column {name!r} is missing beside its partner",
+                f"column {name!r} is given without its partner",
                 where=where,
                 do=f"give {what} in both axes or in none",
             )
@@ -220,6 +220,6 @@ def without_missing(
         raise InputError(
             f"no row has a value in every column that is read: {text}",
             where=source,
-            do="leave such a column out by an empty name in the option 'columns'",
+            do="leave out such a column by an empty name in the option 'columns'",
         )
     return stay, counts

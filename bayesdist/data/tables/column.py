@@ -147,7 +147,7 @@ class SourceColumn:
         good = np.isfinite(out)
         if not good.all():
             bad = int(np.argmin(good))
-            raise self.fail(bad, f"value is {out[bad]:g}, and must be finite")
+            raise self.fail(bad, f"value is {out[bad]:g}, but must be finite")
         return out
 
     def numbers_or(self, value: float) -> Float:
@@ -206,9 +206,7 @@ class SourceColumn:
             try:
                 out.append(parse(_text(text)))
             except (ValueError, TypeError):
-                raise self.fail(
-                    index, f"{_text(text)[:40]!r} stands where {wanted} must be"
-                ) from None
+                raise self.fail(index, f"{_text(text)[:40]!r} is not {wanted}") from None
         return np.array(out)
 
     def integers(self) -> Int:
@@ -222,7 +220,7 @@ class SourceColumn:
         is_integer = values == np.rint(values)
         if not is_integer.all():
             bad = int(np.argmin(is_integer))
-            raise self.fail(bad, f"value is {values[bad]:g}, and must be a whole number")
+            raise self.fail(bad, f"value is {values[bad]:g}, but must be a whole number")
         return values.astype(np.int64)
 
     def labels(self) -> tuple[Int, tuple[str, ...]]:
@@ -239,7 +237,7 @@ class SourceColumn:
                 ]
             except TypeError:  # Parquet has lists and structures
                 index = [isinstance(v, Hashable) for v in values].index(False)
-                raise self.fail(index, "several values stand where a name must be") from None
+                raise self.fail(index, "there are several values instead of one name") from None
             codes = np.array(numbers, np.int64)
             distinct: Iterable[Any] = [v for _, v in code_of_value]
         else:
@@ -277,7 +275,7 @@ class SourceColumn:
             bad = int(np.argmin(good))
             raise self.fail(
                 bad,
-                f"epoch is {out[bad]:g}, which is no year",
+                f"epoch is {out[bad]:g}, which is not a year",
                 "give decimal years, ISO dates, or MJD with the unit 'd'",
             )
         return np.asarray(out, np.float64)
@@ -296,11 +294,11 @@ class SourceColumn:
             inside = np.abs(values) < 1e7
             if not inside.all():
                 bad = int(np.argmin(inside))
-                raise self.fail(bad, f"{values[bad]:g} is no Modified Julian Date")
+                raise self.fail(bad, f"{values[bad]:g} is not a Modified Julian Date")
             distinct, codes = np.unique(values, return_inverse=True)
             return np.asarray(Time(distinct, format="mjd", scale="tt").decimalyear, float)[codes]
         raise InputError(
-            f"unit {unit} is not one of dates", where=self.where, do="give 'yr', or 'd' for MJD"
+            f"unit {unit} is not a unit of dates", where=self.where, do="give 'yr', or 'd' for MJD"
         )
 
     def _dates(self, texts: NDArray[Any]) -> Float:
@@ -313,7 +311,7 @@ class SourceColumn:
             except (ValueError, TypeError, InputError):
                 index = int(np.argmax(codes == k))
                 raise self.fail(
-                    index, f"{text[:40]!r} is no date", "write ISO dates or decimal years"
+                    index, f"{text[:40]!r} is not a date", "write ISO dates or decimal years"
                 ) from None
         return np.array(years)[codes]
 
@@ -439,7 +437,7 @@ def conversion(unit: apu.UnitBase | str, to: str, *, where: str) -> float:
         return float(apu.Unit(unit).to(apu.Unit(to)))
     except apu.UnitConversionError:
         raise InputError(
-            f"unit {unit} cannot be brought to {to}",
+            f"unit {unit} cannot be converted to {to}",
             where=where,
             do=scale_advice(str(unit), to, "the values")
             or length_advice(str(unit))

@@ -198,7 +198,7 @@ def find_columns(
     for key, column in (mapping or {}).items():
         if key not in aliases:
             raise InputError(
-                f"columns has the key {key!r}, which is no quantity",
+                f"columns has the key {key!r}, which is not a known quantity",
                 where=source,
                 do=f"use {_nearest(key, aliases)}",
             )
@@ -226,7 +226,7 @@ def find_columns(
             raise InputError(
                 f"no column for {key!r} among {', '.join(names) or 'none'}",
                 where=source,
-                do="rename the column, or name it in the option 'columns'",
+                do="rename the column, or name it with the option 'columns'",
             )
     return {key: column for key, column in column_names.items() if column}
 

@@ -157,7 +157,7 @@ class ParquetPart:
                 raise self._changed()
             for column in sorted(nested_texts(stored).intersection(columns)):
                 raise InputError(
-                    "several texts stand in a cell",
+                    "a cell contains several strings",
                     where=f"{self.name}, column {column!r}",
                     do="give a column with one value in each row",
                 )

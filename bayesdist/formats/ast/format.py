@@ -174,11 +174,11 @@ def _inverse(kind: str, poly: PolyMap) -> Iterator[Finding]:
         yield Finding("error", "NCF", "one output has no term")
     pairs = [tuple(row[1:]) for row in poly.rows]
     if len(set(pairs)) < len(pairs):
-        yield Finding("warning", "PF", "a term stands twice, and both are added")
+        yield Finding("warning", "PF", "a term occurs twice, and both are added")
     if not poly.iter_inverse and not len(poly.inverse_rows):
         yield Finding(
-            "error", "IterInv", "is missing, as an explicit inverse is: there is no way from the "
-            "sky back to pixels",
+            "error", "IterInv",
+            "is missing, as is an explicit inverse: the sky cannot be transformed back to pixels",
         )  # fmt: skip
 
 

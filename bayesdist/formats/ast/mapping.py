@@ -61,19 +61,23 @@ def _object(kind: str, lines: Iterator[tuple[int, str]], where: str) -> AstObjec
             continue
         if (match := _BEGIN.match(line)) is not None:
             if not waiting:
-                raise FormatError(f"a {match[1]} belongs to nothing", where=at, do="write it again")
+                raise FormatError(
+                    f"a {match[1]} belongs to no object", where=at, do="write it again"
+                )
             parsed.parts[waiting], waiting = _object(match[1], lines, where), ""
         elif (match := _END.match(line)) is not None:
             if match[1] != kind:
-                raise FormatError(f"ends a {match[1]} and not the {kind}", where=at, do="check it")
+                raise FormatError(f"ends a {match[1]} but not the {kind}", where=at, do="check it")
             return parsed
         elif (match := _VALUE.match(line)) is not None:
             waiting = match[1] if not match[2] else ""
             if match[2]:
                 parsed.values[match[1]] = match[2]
         else:
-            raise FormatError("is no line of a dump", where=at, do="write it again")
-    raise FormatError(f"the {kind} does not end: the file is cut", where=where, do="fetch it again")
+            raise FormatError("is not a line of a dump", where=at, do="write it again")
+    raise FormatError(
+        f"the {kind} does not end: the file is truncated", where=where, do="fetch it again"
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +141,7 @@ def steps_of(found: AstObject, where: str) -> tuple[Step, ...]:
         except FormatError as error:
             raise FormatError(error.cause, where=where, do=error.do) from None
     raise InputError(
-        f"has a {found.kind}, which is no polynomial of pixels",
+        f"has a {found.kind}, which is not a polynomial of pixels",
         where=where,
         do="give the mapping from pixels to intermediate coordinates alone: a PolyMap, or a chain "
         "of them and of linear mappings",
@@ -172,7 +176,7 @@ def _rows(found: AstObject, kind: str) -> Float:
             powers = [found.number(f"P{kind}{2 * (n - 1) + a}", 0) for a in (1, 2)]
             coefficient = found.number(f"C{kind}{n}")
             if not (np.isfinite(coefficient) and all(p == int(p) >= 0 for p in powers)):
-                raise FormatError(f"row {n} of the PolyMap is no term", do="write it again")
+                raise FormatError(f"row {n} of the PolyMap is not a term", do="write it again")
             if sum(powers) > MAX_ORDER and coefficient:
                 raise InputError(
                     f"the PolyMap has order {sum(powers):g}", do=f"give one up to {MAX_ORDER}"

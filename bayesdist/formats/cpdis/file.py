@@ -87,7 +87,7 @@ class CpdisImage:
             function = self.function(axis)
             if function and function != "LOOKUP":
                 raise FormatError(
-                    f"CPDIS{axis} is {function}, no look-up table", where=self.where,
+                    f"CPDIS{axis} is {function}, not a look-up table", where=self.where,
                     do="give a header with CPDIS LOOKUP",
                 )  # fmt: skip
             if function and plane is None:

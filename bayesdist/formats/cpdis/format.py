@@ -299,13 +299,13 @@ def _tables(image: CpdisImage) -> Iterator[Finding]:
         if sigma is None and any((ERRORS, image.version(k)) in image.tables for k in (1, 2)):
             yield Finding(
                 "warning", f"{ERRORS},{image.version(axis)}",
-                "is missing, and the errors of the other axis are there",
+                "is missing, although the other axis has errors",
             )  # fmt: skip
         if sigma is not None and (
             sigma.image.shape != values.shape or not (sigma.image >= 0).all()
         ):
             yield Finding(
-                "warning", f"{ERRORS},{image.version(axis)}", "is no table of errors of the nodes"
+                "warning", f"{ERRORS},{image.version(axis)}", "is not a table of node errors"
             )
     if largest and 0 < max(largest) < _TINY:
         yield Finding(
@@ -321,7 +321,7 @@ def _registration(image: CpdisImage, plane: Plane, where: str) -> Iterator[Findi
         zip(plane.nodes.shape[::-1], plane.first, plane.step, image.size, strict=True)
     ):
         if step <= 0:
-            yield Finding("error", where, f"CDELT{axis + 1} is {step:g}, no step between nodes")
+            yield Finding("error", where, f"CDELT{axis + 1} is {step:g}, not a step between nodes")
             continue
         low, high = first - 0.5, size + 0.5 - (first + (n - 1) * step)
         if abs(low - high) / 2 > _ASKEW * step or max(low, high) > 1.5 * step:

@@ -221,7 +221,7 @@ def _entries(
             )
         if names in listed:
             raise InputError(
-                f"the filter combination {names} stands twice",
+                f"the filter combination {names} occurs twice",
                 where=location,
                 do="name each one once",
             )
@@ -250,7 +250,7 @@ def _arcsec(unit: str, scale_arcsec: float | None) -> float:
         return ARCSEC[unit]
     if scale_arcsec is None:
         raise InputError(
-            "u and v are in pixels, and an IDCTAB is in arcseconds",
+            "u and v are in pixels, but an IDCTAB is in arcseconds",
             where="detector.scale_mas",
             do="give the pixel scale (scale_mas in Python, --scale of convert)",
         )
@@ -273,9 +273,9 @@ def _check_alike(
     a, b = calibration.model, first.model
     if a.order != b.order or a.chips != b.chips:
         raise InputError(
-            "the solution has another order or other chips than the first one",
+            "order or chips differ from those of the first filter",
             where=location,
-            do="fit all filters with one structure",
+            do="fit all filters with the same order and chips",
         )
     if a.time is None:
         return
@@ -295,7 +295,7 @@ def _check_alike(
         )
     if not alike:
         raise InputError(
-            "the solution drifts otherwise than the first one, and a file stores one drift",
+            "the drift differs from that of the first filter, but an IDCTAB can store only one",
             where=location,
             do="give it the same reference date and rates (`drift.storable`)",
         )

@@ -136,14 +136,16 @@ def storable(
     solution = calibration.solution
     if solution.model.unit not in ARCSEC:
         raise InputError(
-            f"u and v are in {solution.model.unit}, and the axes of an IDCTAB are angles",
+            f"u and v are in {solution.model.unit}, but the axes of an IDCTAB are angles",
             where="model.unit",
             do="orient the solution first",
         )
     first, last = years
     if not first < last:
         raise InputError(
-            f"the years {first} to {last} do not rise", where="years", do="give first and last date"
+            f"the years {first} to {last} are not ascending",
+            where="years",
+            do="give first and last date",
         )
     _check_like(solution, like, segment)
     view: Solution = solution

@@ -301,7 +301,7 @@ def _uncertainty(tab: IdcTab) -> Iterator[Finding]:
                 worst = max(worst, float(np.max(difference, initial=0.0)) / scale)
     if worst > 1e-9:
         yield Finding(
-            "error", location, f"sigma and covariance differ by up to {worst:.2g} of themselves"
+            "error", location, f"sigma and covariance differ by up to {100 * worst:.2g} %"
         )
 
 

@@ -78,7 +78,7 @@ def check_time(model: DistortionModel, *, acs_wfc: bool) -> None:
             )
     if model.time.n_segments > 1:
         raise InputError(
-            f"an IDCTAB holds one reference date, and there are {model.time.n_segments} segments",
+            f"an IDCTAB holds one reference date, but there are {model.time.n_segments} segments",
             where="model.tdd.breaks",
             do="fit each segment by itself and write a file for each",
         )
@@ -187,7 +187,7 @@ def chip_inverse(calibration: Calibration, chip: int, factor: float) -> ChipInve
         raise InputError(
             f"the distortion of chip {chip} maps several pixels to one position",
             where="INVERSE rows",
-            do="lower the order, fit stars over the whole chip, or leave the inverse out",
+            do="lower the order, fit stars over the whole chip, or leave out the inverse",
         ) from error
     sigma = np.zeros(2 * len(inverse.x_terms))
     if chip_map.cov is not None and inverse.jacobian is not None:

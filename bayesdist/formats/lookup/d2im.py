@@ -76,7 +76,7 @@ def write_d2im(
     for table in tables:
         if table.filter:
             raise InputError(
-                f"the look-up table {table.label} is not the detector's",
+                f"the look-up table {table.label} is not a table of the detector",
                 where=location,
                 do="give the tables of filters to write_npol",
             )

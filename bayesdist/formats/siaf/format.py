@@ -296,7 +296,7 @@ def _linear(table: SiafTable) -> Iterator[Finding]:
     if 0 < pixel < _SMALLEST_PIXEL:
         yield Finding(
             "error", "Sci2IdlX, Sci2IdlY",
-            f"a pixel is {pixel:.4g} wide, which are no arcsec (in degrees: {3600 * pixel:.4g} "
+            f"a pixel is {pixel:.4g} wide, which cannot be arcsec (in degrees: {3600 * pixel:.4g} "
             "arcsec)",
         )  # fmt: skip
     constant = float(np.hypot(x.get((0, 0), 0.0), y.get((0, 0), 0.0)))
@@ -314,7 +314,9 @@ def _inverse_checks(table: SiafTable) -> Iterator[Finding]:
         yield Finding("error", location, "the inverse is missing: all its coefficients are zero")
         return
     if closure is None:
-        yield Finding("note", location, "the size of the detector is not known: it is not checked")
+        yield Finding(
+            "note", location, "the size of the detector is unknown: the inverse is not checked"
+        )
         return
     yield from _INVERSE.findings(
         closure,

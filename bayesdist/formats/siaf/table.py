@@ -108,11 +108,10 @@ class SiafTable:
         nominal = self.size
         if nominal is not None and tuple(nominal) != tuple(size):
             raise InputError(
-                f"the image has {nominal[0]:g} x {nominal[1]:g} pixels, and "
-                f"{size[0]:g} x {size[1]:g} "
-                "are given",
+                f"the image has {nominal[0]:g} x {nominal[1]:g} pixels, but {size[0]:g} x "
+                f"{size[1]:g} are given",
                 where=self.name,
-                do="leave the size out, or give that of the aperture",
+                do="leave out the size, or give that of the aperture",
             )
         return replace(self, stated={**self.stated, "XSciSize": size[0], "YSciSize": size[1]})
 
@@ -212,7 +211,7 @@ def table_of(content: Content) -> SiafTable:
         location = f"{content.name}, line {number}"
         if len(cells) != len(names):
             raise FormatError(
-                f"has {len(cells)} values, and there are {len(names)} columns",
+                f"has {len(cells)} values, but there are {len(names)} columns",
                 where=location,
                 do="fetch the file again",
             )
@@ -258,7 +257,7 @@ def _number(text: str, where: str) -> float:
     except ValueError:
         value = np.nan
     if not np.isfinite(value):
-        raise FormatError(f"{text!r} is no finite number", where=where, do="correct the value")
+        raise FormatError(f"{text!r} is not a finite number", where=where, do="correct the value")
     return value
 
 
@@ -273,7 +272,7 @@ def _record_of_side(content: Content) -> Mapping[str, Any]:
         record = json_of(content.text, content.name)["bayesdist"]
     except (FormatError, KeyError, TypeError) as error:
         raise FormatError(
-            f"is no side file of a SIAF table ({reason_of(error)})",
+            f"is not an auxiliary file of a SIAF table ({reason_of(error)})",
             where=content.name,
             do="fetch the file again",
         ) from error
@@ -332,8 +331,8 @@ def siaf_calibration(table: SiafTable, _: str, choice: Choice) -> Calibration:
     size = table.size
     if size is None:
         raise MissingSizeError(
-            f"does not say how large the image is, and the aperture {table.aperture} is no full "
-            "frame that is known here",
+            f"does not state the size of the image, and the aperture {table.aperture} is not a "
+            "known full frame",
             where=table.name,
             do="give its size (--size XSciSize YSciSize), or write comments such as "
             "'# XSciSize = 320' and '# XSciRef = 160.5' into the table",

@@ -244,13 +244,13 @@ def _check_options(
         raise InputError(f"scale is {scale_arcsec} arcsec per pixel", do="give a positive number")
     if model.time is not None and epoch is None:
         raise InputError(
-            "a SIP header holds for one epoch, and the model depends on time",
+            "a SIP header holds for one epoch, but the model depends on time",
             where="epoch",
             do="give an epoch in decimal years (assess.epoch in a configuration)",
         )
     if tangent_point is not None and (model.unit == "pix" or origin is not None):
         raise InputError(
-            "a tangent point is given beside u, v in pixels or an origin of one's own",
+            "a tangent point is given together with u, v in pixels or a chosen origin",
             where="tangent_point",
             do="leave one of them out",
         )
@@ -270,9 +270,9 @@ def _is_in_frame(
         return False
     if tangent_point is not None or crval is not None:
         raise InputError(
-            "linear axes are those of u, v without a position on the sky, and these have one",
+            "linear axes are for u, v without a position on the sky, but these have one",
             where="products.sip.axes",
-            do="leave axes out, or crval",
+            do="leave out axes or crval",
         )
     return True
 
@@ -299,7 +299,8 @@ def _units_per_pixel(poly: Monomials, unit: str, scale_arcsec: float | None) -> 
         pixel = float(np.sqrt(abs(np.linalg.det(poly.linear))))
     if np.abs(poly.linear / pixel - np.eye(2)).max() > _NEAR_IDENTITY:
         raise InputError(
-            "u and v do not run along x and y, so the linear part is no small correction of pixels",
+            "u and v do not run along x and y, so the linear part is not a small correction of "
+            "pixels",
             where="products.sip.linear",
             do="choose 'cd'",
         )

@@ -105,9 +105,13 @@ def _sigmas(sip: SipHeader) -> Iterator[Finding]:
 def _frame(sip: SipHeader) -> Iterator[Finding]:
     ra, dec = sip.crval
     if not sip.linear_axes and not (abs(ra) <= 360 and abs(dec) <= 90):
-        yield Finding("error", "CRVAL1, CRVAL2", f"({ra:g}, {dec:g}) degrees lie on no sphere")
+        yield Finding(
+            "error", "CRVAL1, CRVAL2", f"({ra:g}, {dec:g}) degrees are not a position on the sphere"
+        )
     if not np.abs(sip.crpix).max() <= FAR:
-        yield Finding("error", "CRPIX1, CRPIX2", f"{sip.crpix[0]:g}, {sip.crpix[1]:g} is no pixel")
+        yield Finding(
+            "error", "CRPIX1, CRPIX2", f"{sip.crpix[0]:g}, {sip.crpix[1]:g} is not a pixel"
+        )
     determinant = float(np.linalg.det(sip.cd))
     yield from _LINEAR.findings(determinant, mirror=0 if sip.linear_axes else 1)
     if sip.linear_axes and determinant != 0:
@@ -176,7 +180,7 @@ def _dmax(sip: SipHeader, size: tuple[int, int]) -> Iterator[Finding]:
             yield Finding(
                 "note" if abs(high) <= _DMAX_ROUGH * true else "warning",
                 f"{prefix}_DMAX",
-                f"says {stated:.4g} px, and the maximum is {true:.4g} px"
+                f"says {stated:.4g} px, but the maximum is {true:.4g} px"
                 + (f" ({100 * high / true:+.2g} %)" if true else ""),
             )
 

@@ -61,7 +61,7 @@ def build(
     """Build the file; its summary gives the largest rounding and interpolation error in pixels."""
     if len(calibration.numbers) > 1:
         raise InputError(
-            f"an STDGDC file is of one detector, and this one has the chips "
+            "an STDGDC file is of one detector, but this one has the chips "
             f"{', '.join(map(str, calibration.numbers))}",
             where="products.stdgdc",
             do="write them one by one (Calibration.only in Python, --chip of convert)",
@@ -186,7 +186,7 @@ def _readable(file: StdGdc) -> bool:
 def _extensions(file: StdGdc) -> Iterator[Finding]:
     for name in file.missing:
         level = "error" if name in EXTENSIONS[:3] else "warning"
-        yield Finding(level, name, "the extension is missing, and programs count on five")
+        yield Finding(level, name, "the extension is missing, but programs expect five")
     names = [hdu.name for hdu in file.content.hdus[1:6]]
     if not file.missing and tuple(names) != EXTENSIONS:
         yield Finding(
@@ -195,7 +195,7 @@ def _extensions(file: StdGdc) -> Iterator[Finding]:
             "extensions are read by their position: XGC, YGC, MGC, XCG, YCG",
         )
     if not _readable(file):
-        yield Finding("error", "XGC, YGC", "are no pair of tables of one shape")
+        yield Finding("error", "XGC, YGC", "are not a pair of tables of the same shape")
         return
     nx, ny = file.size
     for axis, n in (("XGC", nx), ("YGC", ny)):
@@ -203,7 +203,7 @@ def _extensions(file: StdGdc) -> Iterator[Finding]:
         if stated is None:
             yield Missing(f"NDIM_{axis}", ", and programs stop without it").finding
         elif int(stated) != n:
-            yield Finding("error", f"NDIM_{axis}", f"is {stated}, and the table has {n}")
+            yield Finding("error", f"NDIM_{axis}", f"is {stated}, but the table has {n}")
 
 
 def _tables(file: StdGdc) -> Iterator[Finding]:
@@ -228,7 +228,7 @@ def _tables(file: StdGdc) -> Iterator[Finding]:
             yield Finding(
                 "error",
                 axis,
-                f"grows by {slope:.3g} a pixel: its unit is the pixel of the detector",
+                f"increases by {slope:.3g} per pixel: its unit is the pixel of the detector",
             )
             return
     ny, nx = xgc.shape
@@ -246,7 +246,7 @@ def _inverse(file: StdGdc, xgc: Float, ygc: Float) -> Iterator[Finding]:
         return
     back = file.table("XCG"), file.table("YCG")
     if back[0].shape != back[1].shape:
-        yield Finding("error", "XCG, YCG", "are no pair of tables of one shape")
+        yield Finding("error", "XCG, YCG", "are not a pair of tables of the same shape")
         return
     if not all(np.isfinite(b).all() for b in back):
         return
@@ -297,9 +297,9 @@ def _stored(file: StdGdc) -> Iterator[Finding]:
         values = file.table(name)
         wrong = np.abs(values) > 1 if name == "CXYGC" else values < 0
         if wrong.any() or not np.isfinite(values).all():
-            yield Finding("warning", name, "holds values that are no errors")
+            yield Finding("warning", name, "holds values that are not errors")
         if values.shape != file.table("XGC").shape:
-            yield Finding("warning", name, "has not the shape of the tables")
+            yield Finding("warning", name, "differs in shape from the tables")
     try:
         stdgdc_calibration(file, file.name, Choice())
     except FormatError as error:

@@ -82,7 +82,7 @@ def build(
     model = calibration.model
     if model.order > HIGHEST:
         raise InputError(
-            f"TPV holds polynomials up to order {HIGHEST}, and this one has order {model.order}",
+            f"TPV holds polynomials up to order {HIGHEST}, but this one has order {model.order}",
             where=location,
             do="fit a lower order, or write it with order 7 (--order 7 of convert)",
         )
@@ -200,8 +200,8 @@ def _types(head: TpvHead) -> Iterator[Finding]:
     if all(t.endswith("-TAN") for t in head.ctype):
         yield Finding(
             "warning", "CTYPE1",
-            "is TAN with the PV of a TPV, as SCAMP wrote it before: wcslib takes it for TPV, and "
-            "programs that keep to the standard leave the distortion out",
+            "is TAN with the PV of a TPV, as SCAMP used to write: wcslib treats it as TPV, but "
+            "programs that follow the standard ignore the distortion",
         )  # fmt: skip
     elif not all(t.endswith("-TPV") for t in head.ctype):
         yield Finding("error", "CTYPE1", f"the axes are {types}: only one of them is TPV")
@@ -221,7 +221,7 @@ def _first_terms(head: TpvHead) -> Iterator[Finding]:
         elif first < 0:
             yield Finding("error", f"PV{axis}_1", f"is {first:g}: the axis runs backwards (parity)")
         elif not 0.5 < first < 2:
-            yield Finding("warning", f"PV{axis}_1", f"is {first:g}, and 1 is usual")
+            yield Finding("warning", f"PV{axis}_1", f"is {first:g}, but 1 is usual")
         second = pv.get(2, 0.0)
         if first is not None and abs(second) > abs(first):
             yield Finding(

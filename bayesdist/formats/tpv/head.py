@@ -188,7 +188,7 @@ def _head(header: fits.Header, place: int, where: str) -> TpvHead:
             m = int(match[2])
             if m not in POWERS and m not in RADIAL:
                 raise FormatError(
-                    "is of an order above 7, which TPV has not",
+                    "is of an order above 7, which TPV cannot represent",
                     where=f"{where}, keyword {keyword}",
                     do="remove it, or lower the order",
                 )
@@ -263,13 +263,13 @@ def _form(head: TpvHead, name: str) -> TangentForm:
     form = tangent_form(head.header, name)
     if form is None:
         raise FormatError(
-            f"has the axes {', '.join(head.ctype)}, which are no positions on the sky",
+            f"has the axes {', '.join(head.ctype)}, which are not positions on the sky",
             where=name,
             do="correct CTYPE",
         )
     if (form.wcs.wcs.get_cdelt() != 1).any():
         raise InputError(
-            "states its linear part other than by CD in degrees: programs disagree on the unit in "
+            "does not state its linear part as CD in degrees: programs disagree on the unit in "
             "which PV are then applied (wcslib applies them before CDELT)",
             where=name,
             do="write CD in degrees, CUNIT 'deg' and no CDELT",
@@ -295,7 +295,7 @@ def _check(file: TpvFile, name: str) -> None:
             raise InputError(
                 f"its chips {first.number} and {head.number} touch the sky at different points",
                 where=name,
-                do="give headers of one CRVAL, as of one exposure of a mosaic",
+                do="give headers with the same CRVAL, as from one exposure of a mosaic",
             )
 
 

@@ -196,7 +196,7 @@ def grouped_errors(
     labels = tuple(names[k] for k in present)
     if by and len(labels) < 2:
         raise InputError(
-            f"outliers.jitter_by is {by!r}, and all matches are of one {by}",
+            f"outliers.jitter_by is {by!r}, but all matches have the same {by}",
             where=", ".join(table.sources),
             do=f"leave it out, or name the column of the {by}s in data.columns",
         )

@@ -313,7 +313,7 @@ def _possible(correlations: Float | None, n_stars: int, n: int) -> Float | None:
         return None
     if len(correlations) < n_stars or min(correlations.shape[1:]) < n:
         raise InputError(
-            f"correlations have shape {correlations.shape}, and {n_stars} stars need "
+            f"correlations have shape {correlations.shape}, but {n_stars} stars need "
             f"{(n_stars, n, n)}",
             where="correlations",
             do="give a matrix for each star",

@@ -241,13 +241,13 @@ def new_model(released: DistortionModel, matches: Matches) -> DistortionModel:
     location = ", ".join(matches.sources)
     if matches.unit != released.unit:
         raise InputError(
-            f"the new matches are in {matches.unit} and the release is in {released.unit}",
+            f"the new matches are in {matches.unit}, but the release is in {released.unit}",
             where=location,
             do="convert them to one unit",
         )
     if released.time is not None and not matches.has_epoch:
         raise InputError(
-            "the release depends on time and the new matches have no epochs",
+            "the release depends on time, but the new matches have no epochs",
             where=location,
             do="map column 'epoch'",
         )

@@ -155,7 +155,7 @@ def _surfaces(
     n = len(sums.count)
     if n <= n_terms[-1]:
         raise DegenerateError(
-            f"{n} bins have stars, and order {orders[-1]} has {n_terms[-1]} terms",
+            f"{n} bins have stars, but order {orders[-1]} has {n_terms[-1]} terms",
             where="orders",
             do="give more bins or lower the highest order",
         )

@@ -109,7 +109,7 @@ def compare_periods(
     model = fit.model
     if model.n_frame or model.time is not None:
         raise InputError(
-            "periods are compared by polynomials alone, and the model has "
+            "periods are compared by polynomials only, but the model has "
             + ("frames of exposures" if model.n_frame else "time-dependent terms"),
             where="model",
             do="set model.frames = 'none' (refer the pairs to common solutions first) and drop the "

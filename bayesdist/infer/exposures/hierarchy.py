@@ -363,8 +363,8 @@ def _require_determined(scatter: Scatter, model: DistortionModel) -> None:
         n = len(scatter.kind) // len(scatter.kinds)
         drifts = model.time is not None
         raise DegenerateError(
-            f"the scatter of {worst!r} is not determined: {n} exposures are no more than the "
-            f"linear terms{' and their drift' if drifts else ''} absorb",
+            f"the scatter of {worst!r} is not determined: the linear "
+            f"terms{' and their drift' if drifts else ''} can fit {n} exposures exactly",
             where="exposures",
             do="give more exposures, or "
             + (

@@ -165,7 +165,7 @@ def _require_alike(reference: DistortionModel, model: DistortionModel) -> None:
         raise InputError(
             f"the term {missing[0]} does not drift in the reference solution",
             where=f"{location}.terms",
-            do="configure both alike",
+            do="configure both in the same way",
         )
     for attribute, mine, theirs in (
         ("chips", model.chips, reference.chips),
@@ -178,5 +178,5 @@ def _require_alike(reference: DistortionModel, model: DistortionModel) -> None:
             raise InputError(
                 f"the {attribute} are not those of the reference solution{details}",
                 where=location,
-                do="configure both alike",
+                do="configure both in the same way",
             )

@@ -202,7 +202,7 @@ def checked_stars(
         wanted = (n, 2) if name in ("shift", "variance") else (n,)
         if array.shape != wanted:
             raise InputError(
-                f"'{name}' has shape {array.shape} and {wanted} is expected",
+                f"'{name}' has shape {array.shape}, but {wanted} is expected",
                 where=location,
                 do="give one row for each star",
             )

@@ -231,9 +231,9 @@ def _check(
     for table in map(shifts_of, beneath):
         if table.filter:
             raise InputError(
-                f"the look-up table {table.label} is not the detector's",
+                f"the look-up table {table.label} is not a table of the detector",
                 where="beneath",
-                do="give tables of no filter",
+                do="give tables without a filter",
             )
     present = [matches.filter_names[k] for k in np.unique(matches.filter)]
     if len(present) > 1:

@@ -62,7 +62,7 @@ class NodeGrid:
         ny, nx = self.shape
         if min(nx, ny) < 2 or nx * ny <= self.basis.n_terms:
             raise InputError(
-                f"{nx} x {ny} nodes hold no more than a polynomial of order {self.order}",
+                f"{nx} x {ny} nodes cannot describe more than a polynomial of order {self.order}",
                 where=f"look-up table of chip {self.chip.number}",
                 do="give a smaller step or a lower order",
             )

@@ -201,9 +201,9 @@ def refuse_geometry(
     x, y, unit = first.scales
     if tangent_point is not None and _in_radians(first.stretch, *tangent_point):
         raise InputError(
-            f"the pixel is {x} x {y} {unit}, and the field is at ra {tangent_point[0]:.4g}, dec "
-            f"{tangent_point[1]:.4g}: square pixels have this shape if both are in radians and are "
-            "read as degrees",
+            f"the pixel is {x} x {y} {unit}, but the field is at ra {tangent_point[0]:.4g}, dec "
+            f"{tangent_point[1]:.4g}: square pixels have this shape if both are in radians and "
+            "are read as degrees",
             where=where,
             do="convert ra and dec to degrees, or give the columns the unit rad",
         )
@@ -225,7 +225,7 @@ def refuse_geometry(
     nearest = min(fitted, key=lambda value: abs(value / scale_mas - 1.0))
     if abs(nearest / scale_mas - 1.0) > LARGEST_SCALE_ERROR:
         raise InputError(
-            f"the pixel scale is given as {scale_mas:g} mas, and that of the fit is "
+            f"the pixel scale is given as {scale_mas:g} mas, but that of the fit is "
             f"{number(fitted[0], 5)} mas",
             where="detector.scale_mas",
             do="correct it or leave it out, as u and v are angles; or correct data.unit",

@@ -259,7 +259,7 @@ class ClusterPieces(MappedPieces[Piece_co]):
                     raise InputError(
                         f"has had no workers for {PATIENCE:g} seconds",
                         where=f"cluster {self._where}",
-                        do="start workers, then the run again",
+                        do="start workers, then restart the run",
                     )
         finally:
             results.cancel()
@@ -487,7 +487,7 @@ def _require_version(client: Any) -> None:
     for address, worker_version in sorted(client.run(version).items()):
         if worker_version != __version__:
             raise InputError(
-                f"has bayesdist {worker_version}, and here it is {__version__}",
+                f"has bayesdist {worker_version}, but here it is {__version__}",
                 where=f"worker {address}",
                 do="install one version everywhere",
             )
@@ -497,7 +497,7 @@ def _lost_connection(where: str) -> InputError:
     return InputError(
         "the connection to the scheduler is lost",
         where=f"cluster {where}",
-        do="start it and the run again",
+        do="restart it and the run",
     )
 
 

@@ -117,7 +117,7 @@ class OutlierMixture:
             )
         if self.fraction_prior[0] < LEAST_SHAPE:
             raise InputError(
-                f"Beta{self.fraction_prior} puts too much weight on fractions of next to nothing",
+                f"Beta{self.fraction_prior} puts too much weight on tiny fractions",
                 where="outliers.fraction_prior",
                 do=f"give a first parameter of {LEAST_SHAPE} or more",
             )

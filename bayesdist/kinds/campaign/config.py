@@ -109,7 +109,7 @@ class CampaignConfig(RunConfig):
         """Configuration errors that any run can have, and one if there are no [[chip]] blocks."""
         yield from super().faults()
         if not self.chip:
-            yield "a [campaign] has no [[chip]] blocks; give them, one as the reference"
+            yield "a [campaign] needs [[chip]] blocks; give them, one of them with reference = true"
 
     def named_files(self, base: Path) -> list[Path]:
         """Lists, catalogue and log, and files taken over from other runs."""

@@ -83,7 +83,7 @@ def compare_filters(
         If nothing drifts, or no drifting term is known in all filters.
     """
     if time is None:
-        raise InputError("nothing drifts", where="model.tdd", do="give the terms that do")
+        raise InputError("no term drifts", where="model.tdd", do="give the drifting terms")
     reference = next(iter(series))
     trend = TrendModel("lines" if time.breaks else "line", time.breaks, reference=time.epoch0)
     by_chip: dict[str, list[str]] = {}

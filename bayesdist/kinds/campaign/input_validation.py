@@ -54,7 +54,7 @@ def refuse_unsound(inputs: Inputs) -> None:
             f"the cuts leave none of {len(lists)} detections in {len(lists.lists)} exposures "
             f"({lists.cut_words})",
             where="campaign",
-            do="widen mag, saturation or q_max, or correct the columns that they go by",
+            do="widen mag, saturation or q_max, or correct the columns that they use",
         )
     refuse_few(inputs.log.values("epoch"), config.time() if config.has_free_rates else None)
     _refuse_periods(config.products.release, config.time())
@@ -215,7 +215,7 @@ def _refuse_periods(release: ReleaseBlock | None, time: TimeDependence | None) -
         key = f"products.release.period[{k + 1}]"
         if period.segment > len(edges) - 2:
             raise ConfigError(
-                f"segment {period.segment} is asked for, and the drift has segments 0 to "
+                f"segment {period.segment} is asked for, but the drift has segments 0 to "
                 f"{len(edges) - 2}",
                 where=key,
                 do="correct it, or give model.tdd.breaks",

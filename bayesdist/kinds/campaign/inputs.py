@@ -126,7 +126,7 @@ def _exposures_of(block: CampaignBlock, log: ExposureLog) -> ExposureLog:
         )
     if block.filter is None and len(log.filters) > 1:
         raise InputError(
-            f"there are exposures in {len(log.filters)} filters, and a run calibrates one",
+            f"there are exposures in {len(log.filters)} filters, but a run calibrates only one",
             where=log.source,
             do=f"set campaign.filter to one of {', '.join(log.filters)}",
         )

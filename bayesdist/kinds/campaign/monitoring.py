@@ -54,7 +54,7 @@ def fit_new_exposures(release: Run, new: Path) -> tuple[Matches, NewFit, tuple[s
     fresh = ~is_released[pairs.exposure]
     if not fresh.any():
         raise InputError(
-            f"all of {len(left_out)} exposures are those that the release was made from",
+            f"all of {len(left_out)} exposures were used to make the release",
             where=str(new),
             do="give pairs of other exposures",
         )
@@ -87,7 +87,7 @@ def _pairs(run: RunDirectory | None, new: Path, unit: str) -> Matches:
     if run is None:
         if new.suffix == ".toml":
             raise InputError(
-                "is a configuration, whose star lists would have to be matched first",
+                "is a configuration with star lists that have to be matched first",
                 where=str(new),
                 do="give the folder of its 'bayesdist run', or of 'bayesdist stage match'",
             )
@@ -111,7 +111,7 @@ def _refuse_other_filters(config: Config, pairs: Matches, where: str) -> None:
     other_filters = sorted({name for name in pairs.filter_names if name} - {mine})
     if mine is not None and other_filters:
         raise InputError(
-            f"the pairs are in filter {other_filters[0]}, and the release is in {mine}",
+            f"the pairs are in filter {other_filters[0]}, but the release is in {mine}",
             where=where,
             do="give pairs in the filter of the release",
         )

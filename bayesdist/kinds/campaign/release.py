@@ -102,7 +102,7 @@ def _opened(path: str | Path) -> Run:
     directory = RunDirectory.open(path)
     if not isinstance(directory.config, CampaignConfig):  # only campaigns have filters to release
         raise InputError(
-            "is no run of a campaign", where=str(path), do="give runs that began with star lists"
+            "is not a run of a campaign", where=str(path), do="give runs that began with star lists"
         )
     directory.require("release", ("match", "fit", "sample"))
     return Run.of(directory)
@@ -117,7 +117,7 @@ def _require_alike(by_filter: Mapping[str, Run]) -> ReleaseBlock:
     block = first.config.products.release
     if block is None:
         raise InputError(
-            "has no [products.release], and the first run says what is released",
+            "has no [products.release], but the first run determines what is released",
             where=str(first.directory.path),
             do="put the run of the reference filter first",
         )
@@ -129,7 +129,7 @@ def _require_alike(by_filter: Mapping[str, Run]) -> ReleaseBlock:
                     f"the {name} are not those of {first.directory.path}"
                     + (f": {theirs} and {mine[name]}" if name != "chips" else ""),
                     where=str(run.directory.path),
-                    do="run both filters with one structure",
+                    do="run both filters with the same settings",
                 )
         if not _same_detector(first, run):
             raise InputError(

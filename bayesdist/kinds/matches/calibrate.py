@@ -206,7 +206,7 @@ def calibrate(
     config = parse_config(text, WHERE)
     if not isinstance(config, MatchesConfig):
         raise ConfigError(
-            "settings name a campaign or a self-calibration, which begin with star lists",
+            "settings describe a campaign or a self-calibration, which begins with star lists",
             where=WHERE,
             do="write a configuration file, and give it to bayesdist.run",
         )
@@ -268,7 +268,7 @@ def _stars(matches: Any, sigma: Any, options: Mapping[str, Any]) -> tuple[Matche
         unknown = [key for key in options if key not in READING]
         if unknown:
             raise ConfigError(
-                f"data.{unknown[0]} is no option of reading a table",
+                f"data.{unknown[0]} is not an option for reading a table",
                 where=WHERE,
                 do=f"give one of {', '.join(READING)}",
             )
@@ -276,8 +276,8 @@ def _stars(matches: Any, sigma: Any, options: Mapping[str, Any]) -> tuple[Matche
         matches = Matches(**match_arguments(matches, reading))
     elif options.keys() - {"same_position"}:
         raise ConfigError(
-            f"data.{min(options.keys() - {'same_position'})} is an option of reading, and the "
-            "matches have been read",
+            f"data.{min(options.keys() - {'same_position'})} is an option for reading, but the "
+            "matches have already been read",
             where=WHERE,
             do="give it to bayesdist.read_matches or Matches.from_table",
         )
@@ -376,7 +376,7 @@ def _budget(
         row = {key: getattr(term, key) for key in names} | {"unit": term.unit or unit}
         if row["unit"] is None:
             raise InputError(
-                f"the unit of {term.name!r} is not stated, and the matches have not been read",
+                f"the unit of {term.name!r} is not stated, and the matches have not been read yet",
                 where="terms",
                 do='give UserTerm a unit, such as unit="arcsec"',
             )
@@ -409,7 +409,7 @@ def _merged(configured: Settings, settings: Mapping[str, Any]) -> Settings:
 
 def _given_twice(key: str) -> ConfigError:
     return ConfigError(
-        "is given by an argument and in settings", where=f"{WHERE}: {key}", do="give it once"
+        "is given both as an argument and in settings", where=f"{WHERE}: {key}", do="give it once"
     )
 
 
@@ -429,8 +429,8 @@ def _plain(tree: Any, key: str = "") -> Any:
         raise ConfigError(
             f"{tree} has a unit, which the configuration cannot hold",
             where=f"{WHERE}: {key}",
-            do="give the number in the unit of docs/configuration.md; lengths of an "
-            "OutlierMixture may have units if the stars have been read before",
+            do="give the number in the unit that docs/configuration.md states; lengths of an "
+            "OutlierMixture may have units if the stars have already been read",
         )
     if isinstance(tree, np.ndarray | np.generic):
         return tree.tolist()
@@ -443,7 +443,7 @@ def _plain(tree: Any, key: str = "") -> Any:
 
 def _no_value(value: Any, key: str) -> ConfigError:
     return ConfigError(
-        f"{value!r} is no value of TOML",
+        f"{value!r} cannot be stored in TOML",
         where=f"{WHERE}: {key}",
-        do="give numbers, texts, lists and mappings",
+        do="give numbers, strings, lists and mappings",
     )

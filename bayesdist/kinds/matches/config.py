@@ -82,7 +82,7 @@ class Data(Section):
         advice = length_advice(unit) if isinstance(unit, str) else ""
         if advice and unit not in LENGTHS:
             raise ValueError(
-                f"data.unit is {unit!r}, and positions are in pixels or angles; {advice}"
+                f"data.unit is {unit!r}, but positions are in pixels or angles; {advice}"
             )
         return unit
 
@@ -90,13 +90,13 @@ class Data(Section):
         """Faults of lengths without a plate scale, and of nominal positions outside of tables."""
         if self.unit in LENGTHS and self.plate_scale is None:
             yield (
-                f"data.unit is {self.unit!r}, and positions are in pixels or angles; "
+                f"data.unit is {self.unit!r}, but positions are in pixels or angles; "
                 f"{length_advice(str(self.unit))}"
             )
         if self.has_nominal and self.format not in ("auto", "table"):
             yield (
-                f"nominal positions are columns of tables, and data.format is {self.format!r}; "
-                "leave u_nominal and v_nominal out"
+                f"nominal positions are columns of tables, but data.format is {self.format!r}; "
+                "leave out u_nominal and v_nominal"
             )
 
 
@@ -118,13 +118,15 @@ def _of_its_format(raw: Any, handler: Any, info: ValidationInfo) -> Data:
         formats = (*FORMATS, *mission_formats(), *sections)
         if format not in formats:
             listed = ", ".join(map(repr, formats))
-            raise ValueError(f"data.format is {format!r}, which is no format; give one of {listed}")
+            raise ValueError(
+                f"data.format is {format!r}, which is not a known format; give one of {listed}"
+            )
         kind = sections.get(format, Data)
         for name, section in sections.items():
             for key in raw.keys() & section.model_fields.keys() - kind.model_fields.keys():
                 raise ValueError(
                     f"data.{key} is given, but data.format is {format!r}; set the format to "
-                    f"{name!r}, or leave {key} out"
+                    f"{name!r}, or leave out {key}"
                 )
     if info.mode == "json":  # in JSON mode arrays may become tuples
         return kind.model_validate_json(json.dumps(raw), strict=True)
@@ -181,41 +183,41 @@ class MatchesConfig(RunConfig):
         names = [block.parameter for block in self.prior]
         duplicate = next((name for name in names if names.count(name) > 1), None)
         if duplicate is not None:
-            yield f"two [[prior]] blocks are of {duplicate!r}; give each parameter one"
+            yield f"two [[prior]] blocks are for {duplicate!r}; give at most one for each parameter"
         if self.data.one_array and self.chip:
             yield (
-                f"matches of the format {self.data.format!r} are of one array; give "
+                f"matches in the format {self.data.format!r} are on one array; give "
                 "detector.size in place of [[chip]] blocks"
             )
         by = self.outliers.jitter_by
         if by != "auto" and self.data.sigma == "by_magnitude":
             yield (
-                f"outliers.jitter_by is {by!r}, which is of quoted errors, and data.sigma = "
-                "'by_magnitude' takes errors of both axes from the residuals; leave it out, or "
-                "give columns of errors or a number"
+                f"outliers.jitter_by is {by!r}, which applies to quoted errors, but data.sigma = "
+                "'by_magnitude' takes the errors of both axes from the residuals; leave it out, "
+                "or give columns of errors or a number"
             )
         if by == "chip" and not self.chip:
             yield (
-                "outliers.jitter_by is 'chip', and there is one chip; leave it out, or give "
+                "outliers.jitter_by is 'chip', but there is only one chip; leave it out, or give "
                 "[[chip]] blocks"
             )
         if self.data.has_nominal and self.outliers.match_radius is not None:
             yield from self.circle_faults()
         if self.prior_calibration is not None and self.fit.radial_weight != 1.0:
             yield (
-                "fit.radial_weight counts stars for more than they are, and the calibration of "
-                "[prior_calibration] for what it is; leave one of the two out"
+                "fit.radial_weight increases the weight of stars, but not that of the calibration "
+                "in [prior_calibration]; leave one of the two out"
             )
         if self.periods is None:
             return
         if self.model.frames != "none" or self.model.tdd is not None:
             key = "tdd" if self.model.tdd is not None else "frames"
             yield (
-                f"[periods] compares polynomials alone, and model.{key} is given; drop one of them"
+                f"[periods] compares polynomials only, but model.{key} is given; drop one of them"
             )
         if (self.data.columns or {}).get("epoch") == "":
             yield (
-                "[periods] needs an epoch for every pair, and data.columns leaves the epoch out; "
+                "[periods] needs an epoch for every pair, but data.columns leaves out the epoch; "
                 "name its column there"
             )
 

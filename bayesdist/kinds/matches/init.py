@@ -146,9 +146,9 @@ def init(
     mission = mission_template(matches) if columns is None else None
     if mission is not None and size is not None:
         raise InputError(
-            "is of a kind whose detector is known, with its size",
+            "has a format whose detector size is known",
             where=str(matches),
-            do="leave --size out, and change the size in the configuration if it is another one",
+            do="leave out --size, and change the size in the configuration if it differs",
         )
     draft = draft_of(path, matches, relative, columns, size) if mission is None else None
     if draft is not None:
@@ -268,7 +268,8 @@ def _warn_of_pixels(matches: Matches, where: str) -> None:
     n, (_, *lowest) = sum(batch[0] for batch in batches), np.min(batches, axis=0)
     if n:
         log.warning(
-            "%s: %d of %d positions lie before the first pixel, whose centre is (1, 1): x from "
-            "%.1f, y from %.1f; if they count from elsewhere on the detector, add its pixel there",
+            "%s: %d of %d positions lie before the first pixel, centred on (1, 1): x from %.1f, y "
+            "from %.1f; if they are counted from another pixel of the detector, add the position "
+            "of that pixel",
             *(where, n, len(matches), *lowest),
         )

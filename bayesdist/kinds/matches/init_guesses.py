@@ -86,9 +86,9 @@ def _guess(largest: float) -> int:
     largest -= 0.5
     if largest < 1:
         raise InputError(
-            "no star of a chip lies beyond the first pixel, on x or on y",
+            "along x or y, no star of a chip lies beyond the first pixel",
             where="x, y",
-            do="name the columns of its pixels by --columns, or give --size",
+            do="name the pixel columns with --columns, or give --size",
         )
     for power in (256, 512, 1024, 2048, 4096, 8192):
         if 0.97 * power <= largest <= power:

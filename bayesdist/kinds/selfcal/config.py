@@ -24,7 +24,7 @@ def scale_faults(sigma: float | None, frames: Frames) -> Iterator[str]:
     """Fault of a scatter of scales when the exposures have no scales."""
     if sigma is not None and "scale" not in frames:
         yield (
-            "gauge.exposure_scale_sigma is given, and the exposures have no scales; set "
+            "gauge.exposure_scale_sigma is given, but the exposures have no scales; set "
             "selfcal.frames to 'shift_rotation_scale'"
         )
 
@@ -47,8 +47,8 @@ class SelfcalBlock(StarListsBlock):
         """Fault of a match radius that would increase."""
         if self.start_radius is not None and self.start_radius < self.match_radius:
             yield (
-                "selfcal.start_radius is smaller than selfcal.match_radius; begin with the larger "
-                "one"
+                "selfcal.start_radius is smaller than selfcal.match_radius; make it at least as "
+                "large"
             )
 
 
@@ -162,18 +162,18 @@ class SelfcalConfig(RunConfig):
             )
         if names_nominal(self.selfcal.columns):
             yield (
-                "nominal positions are of matches in [data], and a [selfcal] finds its matches "
-                "itself; leave u_nominal and v_nominal out"
+                "nominal positions belong to matches in [data], but a [selfcal] finds its matches "
+                "itself; leave out u_nominal and v_nominal"
             )
         yield from scale_faults(self.gauge.exposure_scale_sigma, self.selfcal.frames)
         if self.gauge.roll_sigma_deg is not None and "rotation" not in self.selfcal.frames:
             yield (
-                "gauge.roll_sigma_deg is given, and the exposures have no rotations; set "
+                "gauge.roll_sigma_deg is given, but the exposures have no rotations; set "
                 "selfcal.frames to 'shift_rotation'"
             )
         angles = self.gauge.scale is not None or self.gauge.reference is not None
         if (angles or self.selfcal.unit != "pix") and self.detector.scale_mas is None:
-            yield "detector.scale_mas is missing, which turns pixels into seconds of arc; give it"
+            yield "detector.scale_mas is missing, which converts pixels to arcseconds; give it"
 
     def named_files(self, base: Path) -> list[Path]:
         """Star lists, log, initial distortion, and files of the constraints."""

@@ -110,7 +110,7 @@ def refuse_duplicates(
                 raise InputError(
                     f"exposures {names[a]} and {names[b]} have the same detections",
                     where=source,
-                    do="leave one of them out: it says nothing new",
+                    do="leave one of them out: it adds no information",
                 )
 
 

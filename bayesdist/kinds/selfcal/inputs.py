@@ -84,13 +84,13 @@ class Inputs:
         epoch = self.detections.epoch
         if self.catalog is None or self.catalog.tangent_point is None:
             raise InputError(
-                "asks for parallaxes, and nothing says where on the sky the field lies",
+                "asks for parallaxes, but the position of the field on the sky is unknown",
                 where="selfcal.motion",
                 do="give reference stars with ra and dec in gauge.reference",
             )
         if epoch is None:
             raise InputError(
-                "asks for parallaxes, and the exposures have no dates",
+                "asks for parallaxes, but the exposures have no dates",
                 where="selfcal.motion",
                 do="give an exposure log with epochs",
             )
@@ -148,7 +148,7 @@ def read_selfcal(config: SelfcalConfig, base: Path) -> Inputs:
     ]
     if len(used) < 2:
         raise InputError(
-            f"there is one exposure, {names[0]}, and distortion shows between exposures",
+            f"there is only one exposure, {names[0]}, but distortion is measured between exposures",
             where=used[0].source,
             do="give dithered exposures of one field",
         )
@@ -213,7 +213,7 @@ def _of_log(
     has_factor = np.isfinite(factors)
     if has_factor.any() and not has_factor.all():
         raise InputError(
-            f"exposure {names[int(np.argmin(has_factor))]} has no vafactor, and others have",
+            f"exposure {names[int(np.argmin(has_factor))]} has no vafactor, although others do",
             where=log.source,
             do="give it for all exposures, or for none",
         )

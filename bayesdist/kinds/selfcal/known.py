@@ -90,7 +90,7 @@ def read_commanded(
     if len(row_of) < len(codes):
         duplicate = labels[int(np.argmax(np.bincount(codes)))]
         raise InputError(
-            f"exposure {duplicate} stands there twice", where=str(path), do="keep one row of each"
+            f"exposure {duplicate} occurs twice", where=str(path), do="keep one row of each"
         )
     rows = np.array([row_of.get(name, -1) for name in names])
     if (rows < 0).all():
@@ -129,9 +129,9 @@ def _factor(own: str, unit: str, scale_mas: float | None, path: Path) -> float:
         return conversion(own, unit, where=str(path))
     if scale_mas is None:
         raise InputError(
-            f"offsets are in {own}, and u and v in {unit}",
+            f"offsets are in {own}, but u and v are in {unit}",
             where=str(path),
-            do="give detector.scale_mas, by which one is the other",
+            do="give detector.scale_mas for the conversion",
         )
     if own == "pix":
         return conversion("mas", unit, where=str(path)) * scale_mas
@@ -189,9 +189,9 @@ class GaugeConstraints:
         if block.roll_sigma_deg is not None:
             if commanded is None or commanded.roll is None:
                 raise InputError(
-                    "has no column roll, and gauge.roll_sigma_deg is given",
+                    "has no column roll, but gauge.roll_sigma_deg is given",
                     where=str(block.offsets),
-                    do="add the commanded rolls in degrees, from u to v, or leave their error out",
+                    do="add the commanded rolls in degrees, from u to v, or leave out their error",
                 )
             roll, error = commanded.roll, np.radians(block.roll_sigma_deg)
             pieces["commanded rolls"] = lambda theta: _rolls(model, theta, roll, error)

@@ -165,8 +165,8 @@ def refuse_unconnected(table: Table) -> None:
     half = k in rolled_180(np.radians(np.asarray(table["rotation"], float)))
     turned = ", and it lies half a turn from all the others" if half else ""
     raise InputError(
-        f"exposure {name} has {100 * share[k]:.0f} % of its detections where others look in "
-        f"common with them, and the usual share is {100 * usual[k]:.0f} %{turned}",
+        f"exposure {name} has {100 * share[k]:.0f} % of its detections where others look in common "
+        f"with them, but the usual fraction is {100 * usual[k]:.0f} %{turned}",
         where="selfcal.lists",
         do=TURN_BACK
         if half

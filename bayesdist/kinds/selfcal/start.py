@@ -123,7 +123,7 @@ def _first(
         solution = load_fit(path) if path.name == "fit.nc" else load_posterior(path)
         if solution.model.unit != block.unit:
             raise InputError(
-                f"is in {solution.model.unit}, and selfcal.unit is {block.unit!r}",
+                f"is in {solution.model.unit}, but selfcal.unit is {block.unit!r}",
                 where=str(path),
                 do="calibrate in the same unit",
             )
@@ -135,7 +135,7 @@ def _first(
         return earlier
     if unit_arcsec is None:
         raise InputError(
-            "a calibration file is in arcsec, and the pixel scale is unknown",
+            "a calibration file is in arcsec, but the pixel scale is unknown",
             where=str(path),
             do="set detector.scale_mas",
         )

@@ -334,7 +334,7 @@ def _check(
     names = [period.name for period in periods]
     if len(set(names)) < len(names):
         raise InputError(
-            "two periods have one name", where="periods", do="give each a name of its own"
+            "two periods have the same name", where="periods", do="give each a different name"
         )
     available = f"solutions are given for {', '.join(map(str, calibrations))}"
     for table in tables:
@@ -347,7 +347,7 @@ def _check(
     for filter, stand_in in stand_ins.items():
         if stand_in not in calibrations:
             raise InputError(
-                f"{stand_in!r} is to stand in for {filter!r} and has no solution",
+                f"{stand_in!r} is to replace {filter!r}, but has no solution",
                 where="stand_ins",
                 do=available,
             )

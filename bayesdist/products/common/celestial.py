@@ -109,7 +109,7 @@ class TangentForm:
         if not off.max() <= TOLERANCE_MAS:
             raise InputError(
                 f"is read as positions up to {off.max() / pixel:.3g} pixels off those by "
-                "astropy.wcs, so its keywords mean something that is not held here",
+                "astropy.wcs, so its keywords contain something that is not supported",
                 where=where,
                 do=_SAMPLE,
             )
@@ -149,7 +149,7 @@ def tangent_form(header: fits.Header, where: str) -> TangentForm | None:
         return None
     if wcs.naxis != 2:
         raise InputError(
-            f"has {wcs.naxis} axes, and only images of two celestial axes are held",
+            f"has {wcs.naxis} axes, but only images with two celestial axes are supported",
             where=where,
             do="write the header of the two celestial axes: astropy.wcs.WCS(header).celestial",
         )
@@ -178,7 +178,8 @@ def _refuse_point(lon: float, lat: float, where: str) -> None:
     """Raise FormatError if longitude and latitude are not a position on the sky."""
     if not (abs(lon) <= 360 and abs(lat) <= 90):
         raise FormatError(
-            f"the plane touches the sky at ({lon:g}, {lat:g}) degrees: on no sphere",
+            f"the plane touches the sky at ({lon:g}, {lat:g}) degrees, which is not a position on "
+            "the sphere",
             where=where,
             do="correct CRVAL or CUNIT",
         )
@@ -197,7 +198,7 @@ def projection_code(header: fits.Header) -> str:
 def refuse_projection(code: str, where: str) -> None:
     """Raise InputError for a projection that is not supported, given by its code, as 'ZEA'."""
     name = _NAMES.get(code, f"{_article(code)} {code} projection")
-    raise InputError(f"is {name}, and bayesdist holds TAN alone", where=where, do=_SAMPLE)
+    raise InputError(f"is {name}, but bayesdist supports only TAN", where=where, do=_SAMPLE)
 
 
 def _article(code: str) -> str:
@@ -227,7 +228,7 @@ def refuse_oversized(header: fits.Header, where: str) -> None:
             continue  # astropy.wcs refuses it later
         if stated > largest:
             raise FormatError(
-                f"is {stated:g}, and at most {largest} is read",
+                f"is {stated:g}, but at most {largest} is supported",
                 where=f"{where}, keyword {keyword}",
                 do="correct the keyword",
             )
@@ -274,7 +275,7 @@ def _equatorial(w: object, lon: float, lat: float, where: str) -> tuple[Float, t
             return np.eye(2), (lon, lat)
         stated = f"{frame}{f' of equinox {equinox:g}' if np.isfinite(equinox) else ''}"
         raise InputError(
-            f"has right ascension and declination of {stated}, and bayesdist holds those of ICRS",
+            f"has right ascension and declination of {stated}, but bayesdist supports only ICRS",
             where=where,
             do=_SAMPLE,
         )
@@ -283,8 +284,8 @@ def _equatorial(w: object, lon: float, lat: float, where: str) -> tuple[Float, t
     names = {"ELON": "ecliptic", "HPLN": "helioprojective", "HGLN": "heliographic",
              "SLON": "supergalactic", "TLON": "terrestrial"}  # fmt: skip
     raise InputError(
-        f"has {names.get(system, 'celestial')} coordinates ({system}), and bayesdist holds right "
-        "ascension and declination",
+        f"has {names.get(system, 'celestial')} coordinates ({system}), but bayesdist supports only "
+        "right ascension and declination",
         where=where,
         do=_SAMPLE,
     )

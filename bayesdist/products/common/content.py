@@ -88,7 +88,7 @@ class Hdu:
         Raises FormatError if this is not a binary table, or if its cards cannot be read.
         """
         if self.header.get("XTENSION", "").strip() != "BINTABLE":
-            raise FormatError(f"HDU {self.name!r} is no binary table")
+            raise FormatError(f"HDU {self.name!r} is not a binary table")
         try:
             hdu = fits.BinTableHDU.fromstring(self.to_bytes())
             refuse_long_arrays(hdu, Budget(f"HDU {self.name!r}", len(self.data)))
@@ -183,11 +183,11 @@ class Content:
         """
         hdus = self.hdus if self.is_fits else ()
         if not hdus or self.raw[:9] != HDU_STARTS[0]:
-            raise FormatError("is no FITS file", where=self.name, do="check the file")
+            raise FormatError("is not a FITS file", where=self.name, do="check the file")
         broken = next((hdu for hdu in hdus if hdu.state != "whole"), None)
         if broken is not None:
             raise FormatError(
-                f"has {len(self.raw)} bytes, and HDU {broken.number} takes up more",
+                f"has {len(self.raw)} bytes, but HDU {broken.number} takes up more",
                 where=self.name,
                 do="it is truncated or damaged: fetch or write it again",
             )

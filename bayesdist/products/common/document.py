@@ -95,7 +95,7 @@ def required_size(
     size = given if stated is None else stated
     if size is None:
         raise MissingSizeError(
-            f"does not say how large the {what} is",
+            f"does not state the size of the {what}",
             where=name,
             do="give it (size=(NX, NY) in Python, --size NX NY on the command line)",
         )

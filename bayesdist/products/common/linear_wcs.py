@@ -66,7 +66,7 @@ def finite_number(
         raise FormatError("is missing", where=f"{where}, keyword {keyword}", do="add the keyword")
     if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
         raise FormatError(
-            f"value {value!r} is no finite number",
+            f"value {value!r} is not a finite number",
             where=f"{where}, keyword {keyword}",
             do="correct the value",
         )

@@ -129,7 +129,9 @@ def stored_calibration(hdu: Hdu, name: str) -> Calibration:
     cov = np.asarray(rows["COV"], float).reshape(len(rows), -1)
     if stored_terms != expected or cov.shape[0] != cov.shape[1]:
         raise FormatError(
-            "has not the rows of its order and chips", where=location, do="write the file again"
+            "does not have the rows for its order and chips",
+            where=location,
+            do="write the file again",
         )
     mean = np.asarray(rows["VALUE"], float)
     if not (np.isfinite(mean).all() and np.isfinite(cov).all()):
@@ -182,9 +184,9 @@ def refuse_other(far: float, most: float, where: str) -> None:
     """
     if not far <= most:
         raise FormatError(
-            f"the parameters beside it are off by {far:.2g} pixels: one of the two was changed",
+            f"the parameters stored with it are off by {far:.2g} pixels: one was changed",
             where=where,
-            do="keep together what was written together",
+            do="use files that were written together",
         )
 
 
@@ -197,9 +199,9 @@ def agreeing(stored: Calibration, read: Calibration) -> Calibration:
     chips = [(c.number, c.size) for c in stored.model.chips]
     if chips != [(c.number, c.size) for c in read.model.chips] or stored.unit != read.unit:
         raise FormatError(
-            "the parameters beside it are of other chips or another unit",
+            "the parameters stored with it are for other chips or in another unit",
             where=read.name,
-            do="keep together what was written together",
+            do="use files that were written together",
         )
     far = max(largest_difference(stored, read, number) for number in stored.numbers)
     refuse_other(far, AGREE, read.name)

@@ -97,7 +97,7 @@ def at_date(
     """
     if calibration.model.time is not None and epoch is None and calibration.reference_date is None:
         raise InputError(
-            "the file holds for one epoch, and the model depends on time",
+            "the file holds for one epoch, but the model depends on time",
             where=where,
             do="give an epoch in decimal years",
         )
@@ -110,7 +110,7 @@ def at_date(
     unit = calibration.unit
     if unit == "pix" and scale_arcsec is None:
         raise InputError(
-            "u and v are in pixels, and the file is in arcseconds",
+            "u and v are in pixels, but the file is in arcseconds",
             where="detector.scale_mas",
             do="give the pixel scale (scale_mas in Python, --scale of convert)",
         )
@@ -293,7 +293,8 @@ def calibration_from(
     location = f"{name}, bayesdist"
     if record.get("version") != VERSION:
         raise FormatError(
-            f"the record is of version {record.get('version')}, and {VERSION} is read here",
+            f"the record is of version {record.get('version')}, but this version of bayesdist "
+            f"reads {VERSION}",
             where=location,
             do="use the version of bayesdist that wrote it",
         )
@@ -312,7 +313,7 @@ def calibration_from(
     if mean.shape != (model.n_params,) or cov.shape != (model.n_params,) * 2:
         raise FormatError(
             f"{mean.size} parameters and a covariance of {' x '.join(map(str, cov.shape))} do not "
-            f"go with order {model.order}",
+            f"match order {model.order}",
             where=location,
             do="fetch the file again",
         )

@@ -77,7 +77,7 @@ def other_type(stated: str, wanted: str, where: str) -> list[Finding]:
     """Error if a file states another type of reference file than `wanted`."""
     if not stated or stated == wanted:
         return []
-    return [Finding("error", where, f"is {stated!r}, and not {wanted!r}")]
+    return [Finding("error", where, f"is {stated!r}, not {wanted!r}")]
 
 
 def not_finite(values: Float, where: str, message: str) -> list[Finding]:
@@ -131,7 +131,7 @@ def no_grid(values: Float, where: str) -> list[Finding]:
     """Error if an array has fewer than two nodes along an axis, or not two axes."""
     if values.ndim == 2 and min(values.shape) >= 2:
         return []
-    return [Finding("error", where, f"shape {values.shape} is no grid of nodes")]
+    return [Finding("error", where, f"shape {values.shape} is not a grid of nodes")]
 
 
 def no_sigmas(
@@ -348,7 +348,7 @@ def record(
 
 def no_side_file(where: str, name: str, description: str = "the covariance") -> Finding:
     """Warning that the file with the covariance is not beside the file that names it."""
-    return Finding("warning", where, f"{name}, {description}, is not here")
+    return Finding("warning", where, f"{name}, {description}, is missing")
 
 
 def of_part(part: str, findings: Iterable[Finding]) -> list[Finding]:

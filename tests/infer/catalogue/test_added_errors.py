@@ -232,7 +232,7 @@ def test_equal_exposures_are_not_split():
 
 
 def test_one_label_is_refused():
-    with pytest.raises(InputError, match="all matches are of one filter"):
+    with pytest.raises(InputError, match="all matches have the same filter"):
         found_in(stars(9, 300), by="filter")
 
 

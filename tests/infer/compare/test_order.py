@@ -283,7 +283,7 @@ def test_wrong_requests_are_refused(small):
         select_order(matches, replace(model, frames="shift"), orders=(2, 3))
     with pytest.raises(InputError, match="are inconsistent"):
         select_order(matches, model, orders=(2, 3), bins=5, regions=6)
-    with pytest.raises(DegenerateError, match="16 bins have stars, and order 5 has 21 terms"):
+    with pytest.raises(DegenerateError, match="16 bins have stars, but order 5 has 21 terms"):
         select_order(matches, model, orders=(2, 5), bins=4, regions=2)
 
 

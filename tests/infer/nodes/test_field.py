@@ -271,7 +271,7 @@ def test_wrong_input_is_named(rng):
         table_of(x, y, r, variance * 0)
     with pytest.raises(InputError, match="'weight' is 2"):
         table_of(x, y, r, variance, weight=np.full(500, 2.0))
-    with pytest.raises(InputError, match="hold no more than a polynomial"):
+    with pytest.raises(InputError, match="cannot describe more than a polynomial"):
         field_table(x, y, r, variance, chip=CHIP, order=ORDER, step=(320.0, 256.0))
     with pytest.raises(DegenerateError, match="8 stars do not determine a polynomial of order 3"):
         table_of(x[:8], y[:8], r[:8], variance[:8])

@@ -126,5 +126,5 @@ def test_nodes_that_err_together_reach_the_bound():
 
 def test_a_table_of_a_filter_is_not_the_detectors(matches, model):
     alien = LookupTable(1, np.zeros((2, 4, 4)), FILTER, (80.5, 64.5), (160.0, 128.0))
-    with pytest.raises(InputError, match="not the detector's"):
+    with pytest.raises(InputError, match="not a table of the detector"):
         fit_with_tables(matches, model, beneath=[alien], step=STEP)

@@ -433,7 +433,7 @@ def test_unreachable_scheduler(problem, address, monkeypatch):
 
 def test_other_version_on_the_workers(problem, compute, monkeypatch):
     monkeypatch.setattr(cluster_module, "__version__", "99.0")
-    with pytest.raises(errors.InputError, match=r"has bayesdist .*, and here it is 99\.0"):
+    with pytest.raises(errors.InputError, match=r"has bayesdist .*, but here it is 99\.0"):
         load(*problem, compute)
 
 

@@ -70,7 +70,7 @@ def test_the_scheduler_is_killed_during_a_pass():
         cluster.kill()
         cluster.communicate()
     assert out == (
-        f"cluster {address}: the connection to the scheduler is lost; start it and the run again.\n"
+        f"cluster {address}: the connection to the scheduler is lost; restart it and the run.\n"
     )
     assert (client.returncode, err) == (0, "")
 

@@ -173,5 +173,5 @@ def test_both_spellings_name_the_column_of_colours(rng, tmp_path):
     )
     assert_same(by_colour, by_color)
     np.testing.assert_array_equal(by_color.colour, table["tint"][table["band"] == "W1"])
-    with pytest.raises(InputError, match="'hue', which is no quantity"):
+    with pytest.raises(InputError, match="'hue', which is not a known quantity"):
         read_rvb(path, band="W1", columns={"hue": "tint"})

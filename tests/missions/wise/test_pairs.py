@@ -150,7 +150,9 @@ def test_what_a_file_lacks_is_said(rng, tmp_path):
     refused(f"does not contain W3, but {counts}", path, band="W3")
     refused("'W7' is not a band; give one of W1, W2, W3, W4", path, band="W7")
     refused("column 'xx' is missing; name 'x' if that is meant", path, columns={"x": "xx"})
-    refused("columns has the key 'chip', which is no quantity", path, columns={"chip": "band"})
+    refused(
+        "columns has the key 'chip', which is not a known quantity", path, columns={"chip": "band"}
+    )
     table["band"][7] = "K"
     refused("b.tbl, row 8, column 'band': 'K' is not a band", write(table, tmp_path / "b.tbl"))
     table.remove_column("band")
@@ -159,7 +161,7 @@ def test_what_a_file_lacks_is_said(rng, tmp_path):
     refused("d.tbl: no column for 'u' among frame, x, y, v", write(table, tmp_path / "d.tbl"))
     table = rvb_table(rng)
     table.remove_column("sigma_v")
-    refused("column 'sigma_v' is missing beside its partner",
+    refused("column 'sigma_v' is given without its partner",
             write(table, tmp_path / "e.tbl"), band="W1")  # fmt: skip
     refused("no errors", write(table[["band", "x", "y", "u", "v"]], tmp_path / "f.tbl"), band="W1")
 

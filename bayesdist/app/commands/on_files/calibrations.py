@@ -88,7 +88,7 @@ def images_of(
     named = [name for name, value in options if value is not None]
     if len(named) > 1:
         raise InputError(
-            f"{' and '.join(named)} say the same", where="options", do="keep one of them"
+            f"{' and '.join(named)} have the same meaning", where="options", do="keep one of them"
         )
     if image is not None:
         sizes = {chip.number: chip.size for chip in found.model.chips}

@@ -146,13 +146,13 @@ def _sampled(
     refused = next((name for name, value in others.items() if value is not None), None)
     if refused is not None:
         raise InputError(
-            "a header that is sampled has one chip, no filter and no dates",
+            "a sampled header has one chip, no filter and no dates",
             where=f"--{refused}",
             do="leave it out",
         )
     if Path(path).is_dir():
         raise InputError(
-            "is a folder, and --sample is for headers", where=str(path), do="leave --sample out"
+            "is a folder, but --sample needs a header", where=str(path), do="leave --sample out"
         )
     return sampled_calibration(path, order=order, size=size)
 
@@ -163,7 +163,9 @@ def _settings(to: str, options: Sequence[str]) -> FormatSettings:
     for text in options:
         key, mark, value = text.partition("=")
         if not mark or not key.strip():
-            raise InputError(f"{text!r} is not KEY=VALUE", where="--option", do="write it so")
+            raise InputError(
+                f"{text!r} is not KEY=VALUE", where="--option", do="write it in that form"
+            )
         try:
             parsed = toml_of(f"x = {value}", "--option")["x"]
         except InputError:

@@ -30,7 +30,7 @@ def check_output(output: Path, force: bool) -> None:
     """Refuse an output file with an unknown extension, or one that exists."""
     if output.suffix.lower() not in _FORMATS:
         raise InputError(
-            f"extension {output.suffix!r} is not one that can be written",
+            f"extension {output.suffix!r} cannot be written",
             where=str(output),
             do=f"choose one of {', '.join(_FORMATS)}",
         )

@@ -51,7 +51,7 @@ def sky_to_table(
     check_output(output, force)
     if joint and output.suffix.lower() != ".fits":
         raise InputError(
-            "the covariance of all stars is an image, which this format has not",
+            "the covariance of all stars is an image, which this format cannot store",
             where=str(output),
             do="name a .fits file",
         )

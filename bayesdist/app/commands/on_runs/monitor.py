@@ -141,7 +141,7 @@ def _new_matches(release: Run, new: Path) -> tuple[Matches, tuple[str, ...]]:
         config, kind, path = release.config, release.kind, new
         if not kind.reads_matches:
             raise InputError(
-                "is a table, and this kind of run has no [data] that says how to read it",
+                "is a table, but this kind of run has no section [data] that states how to read it",
                 where=str(new),
                 do="give a configuration whose [data] names it",
             )
@@ -187,9 +187,9 @@ def _files_of_release(run: RunDirectory, path: Path | list[Path]) -> list[Path]:
     used_files = [file for file in files if sha256_of(file) in hashes]
     if len(used_files) == len(files):
         raise InputError(
-            "these are matches that the release was made from, and say nothing new of it",
+            "the release was made from these matches, so they cannot test it",
             where=str(used_files[0]),
-            do="give matches that were not in its fit",
+            do="give matches that were not part of its fit",
         )
     return used_files
 

@@ -53,7 +53,7 @@ def plan(run: str | Path, *, name: str | None = None, epochs: Sequence[float] = 
         opened.directory.require("plan", ("fit", "sample", "diagnose", "evaluate"))
         exposures = opened.kind.further_exposures(opened)
         if epochs and exposures.dateless:
-            raise InputError(exposures.dateless, where=str(run), do="leave --epochs out")
+            raise InputError(exposures.dateless, where=str(run), do="leave out --epochs")
         content = content_of(opened)
         needs = needs_of(opened, content, name=name, epochs=epochs)
         lines = [exposures.sentence(content)]

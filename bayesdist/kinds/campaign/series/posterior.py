@@ -360,7 +360,7 @@ def fit_series(
         k = series.n_coefficients
         if intrinsic.shape != (k, k) or not np.all(np.isfinite(intrinsic)):
             raise InputError(
-                f"scatter has shape {intrinsic.shape} or is not finite, and must be a finite "
+                f"scatter has shape {intrinsic.shape} or is not finite, but must be a finite "
                 f"matrix {(k, k)}",
                 where=series.source,
                 do="give the covariance of the coefficients",

@@ -545,8 +545,9 @@ class Design:
             columns = self.matrix(self.series.epoch, self.series.group_code)[0, :, : self.n_fixed]
             if np.linalg.matrix_rank(columns) < self.n_fixed:
                 raise DegenerateError(
-                    f"the groups ({', '.join(self.series.group_names)}) cannot be told from the "
-                    f"trend {self.trend.name!r}: some of them have exposures in one segment only",
+                    f"the groups ({', '.join(self.series.group_names)}) cannot be distinguished "
+                    f"from the trend {self.trend.name!r}: some of them have exposures in one "
+                    "segment only",
                     where=self.series.source,
                     do="leave groups out, or remove a break",
                 )
@@ -561,7 +562,7 @@ class Design:
             need = MIN_EXPOSURES_FOUND * trend.n_segments
             if len(np.unique(series.epoch)) < need:
                 raise DegenerateError(
-                    f"finding {trend.find} breaks needs exposures of at least {need} dates, and "
+                    f"finding {trend.find} breaks needs exposures of at least {need} dates, but "
                     f"there are {len(np.unique(series.epoch))}",
                     where=series.source,
                     do="give the dates of the breaks",

@@ -304,9 +304,9 @@ def _solved(
             continue
         if step is None:
             raise DegenerateError(
-                "the detections do not determine the parameters that are free",
+                "the detections do not determine the free parameters",
                 where="self-calibration",
-                do="look at the gauge: dither more, add roll angles, or give priors",
+                do="check the gauge: dither more, add roll angles, or give priors",
             )
         decrement = float(gradient @ step)
         pieces = at_modes.map(of.moved, theta, theta + step)

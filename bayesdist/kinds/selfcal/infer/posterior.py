@@ -373,9 +373,9 @@ def _mode(target: SelfTarget, jitter: float, z: float) -> _Mode:
                 observed = False
                 continue
             raise DegenerateError(
-                "the detections do not determine the parameters that are free",
+                "the detections do not determine the free parameters",
                 where="self-calibration",
-                do="look at the gauge: dither more, add roll angles, or give priors",
+                do="check the gauge: dither more, add roll angles, or give priors",
             ) from error
         step = factor.solve(np.append(gradient, 0.0))[:-1]
         if gradient @ step < MAX_DECREMENT:

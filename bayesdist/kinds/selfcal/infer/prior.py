@@ -175,7 +175,7 @@ class ReferenceStars:
         if len(rows) < MIN_REFERENCE_STARS:
             raise InputError(
                 f"{len(rows)} of its {len(catalog)} stars are among the {problem.n_stars} detected "
-                f"ones, and {MIN_REFERENCE_STARS} are needed",
+                f"ones, but {MIN_REFERENCE_STARS} are needed",
                 where=catalog.source,
                 do="check epoch, tangent point and unit, or give a larger gauge.reference.radius",
             )

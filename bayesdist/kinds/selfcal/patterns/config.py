@@ -110,8 +110,8 @@ class PatternBlock(Section):
         on_grid = 0 if self.grid is None else self.grid.n[0] * self.grid.n[1]
         if on_grid > MOST_EXPOSURES:
             yield (
-                f"{name} has {on_grid} exposures, and {MOST_EXPOSURES} are the most; "
-                "give a smaller grid"
+                f"{name} has {on_grid} exposures, but at most {MOST_EXPOSURES} are possible; give "
+                "a smaller grid"
             )
         if self.offsets == [] or self.rolls == []:
             key = "offsets" if self.offsets == [] else "rolls"
@@ -123,8 +123,8 @@ class PatternBlock(Section):
                 yield f"{name} has scales without a number of exposures; give it"
             if self.unit != "pix":
                 yield (
-                    f"{name} has a unit, and scales go from least, in pixels, to largest, a part "
-                    "of the detector; leave the unit out"
+                    f"{name} has a unit, but scales range from `least`, in pixels, to `largest`, a "
+                    "fraction of the detector; leave out the unit"
                 )
 
 
@@ -152,12 +152,12 @@ class PlanConfig(Section):
         for pattern in self.patterns():
             if len(pattern) < 2:
                 yield (
-                    f"pattern {pattern.name!r} has one exposure, which says nothing of the "
+                    f"pattern {pattern.name!r} has one exposure, which cannot determine the "
                     "distortion; give at least two"
                 )
             if self.selfcal.frames == "shift" and np.ptp(pattern.rolls) > 0:
                 yield (
-                    f"pattern {pattern.name!r} has rolls, and selfcal.frames is 'shift'; set it to "
+                    f"pattern {pattern.name!r} has rolls, but selfcal.frames is 'shift'; set it to "
                     "'shift_rotation'"
                 )
 

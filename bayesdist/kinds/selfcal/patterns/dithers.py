@@ -209,7 +209,7 @@ def compare_patterns(
     exposures = sum(len(pattern.offsets) for pattern in patterns)
     if len(sky) * exposures > MOST_LOOKED_FOR:
         raise InputError(
-            f"{len(sky)} stars are to be looked for in {exposures} exposures",
+            f"{len(sky)} stars are to be searched for in {exposures} exposures",
             where="pattern",
             do=f"give fewer exposures or stars ({MOST_LOOKED_FOR:.0g} pairs of them at most)",
         )

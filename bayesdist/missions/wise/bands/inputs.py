@@ -57,7 +57,7 @@ def open_bands(paths: Sequence[str | Path]) -> dict[str, BandRun]:
         band = _opened(path)
         if band.name in out:
             raise InputError(
-                f"is of band {band.name}, like {out[band.name].path}",
+                f"is of band {band.name}, as is {out[band.name].path}",
                 where=str(path),
                 do="give one run for each band",
             )

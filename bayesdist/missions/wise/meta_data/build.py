@@ -146,10 +146,10 @@ def _check(band: int, sip: SipHeader, skew: float) -> None:
     if sip.size != (side, side) or sip.crpix != (middle, middle):
         size = "unknown" if sip.size is None else f"{sip.size[0]} x {sip.size[1]}"
         raise InputError(
-            f"the image size is {size} and CRPIX {sip.crpix[0]:g}, {sip.crpix[1]:g}, and the array "
+            f"the image size is {size} and CRPIX {sip.crpix[0]:g}, {sip.crpix[1]:g}, but the array "
             f"of this band has {side} x {side} pixels about {middle:g}, {middle:g}",
             where=location,
-            do="give a header of that array, its reference pixel in the middle",
+            do="give a header of that array with the reference pixel in the middle",
         )
     if not sip.has_inverse:
         raise InputError(
@@ -168,7 +168,7 @@ def _check(band: int, sip: SipHeader, skew: float) -> None:
     along_axes = np.count_nonzero(np.abs(sip.cd) > 1e-9 * np.sqrt(scale2)) == 2
     if not along_axes or np.abs(gram - scale2 * np.eye(2)).max() > 1e-9 * scale2:
         raise InputError(
-            "the CD matrix holds more than a scale, and the file cannot hold it",
+            "the CD matrix is more than a scale, but the file can store only a scale",
             where=location,
             do='make the header with linear = "sip", whose A and B hold all linear terms',
         )

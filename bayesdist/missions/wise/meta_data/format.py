@@ -71,15 +71,15 @@ class MetaDataSettings(FormatSettings):
         band = _band(detector)
         if band is None:
             raise ValueError(
-                "products.wise_meta is of a run of WISE W1, W2, W3 or W4, and detector.name is "
-                f"{detector!r}; name the band there, or leave wise_meta out"
+                "products.wise_meta needs a run of WISE W1, W2, W3 or W4, but detector.name is "
+                f"{detector!r}; name the band there, or leave out wise_meta"
             )
         side, _ = ARRAYS[band]
         if size != (side, side) or reference_pixel not in (None, ((side + 1) / 2,) * 2):
             raise ValueError(
-                f"products.wise_meta is of the whole array of W{band}, {side} x {side} pixels "
+                f"products.wise_meta describes the whole array of W{band}, {side} x {side} pixels "
                 f"about {(side + 1) / 2:g}, {(side + 1) / 2:g}; correct detector.size and "
-                "model.reference_pixel, or leave wise_meta out"
+                "model.reference_pixel, or leave out wise_meta"
             )
 
 
@@ -137,7 +137,7 @@ def _build(
     band = _band(calibration.detector)
     if band is None:
         raise InputError(
-            f"the detector is {calibration.detector!r}, no band of WISE",
+            f"the detector is {calibration.detector!r}, not a band of WISE",
             where="products.wise_meta",
             do="give a run whose detector.name is the band (W1, W2, W3, W4), or a file of WISE",
         )
@@ -261,7 +261,7 @@ def _comments(band: WiseBand) -> Iterator[Finding]:
 def _skew(band: WiseBand) -> Iterator[Finding]:
     if band.skew != 0:
         yield Finding(
-            "warning", "SKEW", f"is {band.skew:g} rad, which SIP cannot hold: put it into CD"
+            "warning", "SKEW", f"is {band.skew:g} rad, which SIP cannot represent: include it in CD"
         )
 
 

@@ -117,7 +117,7 @@ def implied_values(sip: SipHeader, size: tuple[int, int] | None = None) -> tuple
     size = size or sip.size
     if size is None or not (forward_is_used(sip) and inverse_is_used(sip)):
         raise InputError(
-            "without an image size and orders of at least 2 nothing is implied",
+            "an implied coefficient requires an image size and orders of at least 2",
             where="SIP header",
             do="give the size, and a header with A, B, AP and BP",
         )

@@ -90,7 +90,7 @@ def bands_of(content: Content) -> tuple[WiseBand, ...]:
             band, keyword, value, comment = _entry(line, f"{name}, line {number}")
             if keyword in entries.setdefault(band, {}):
                 raise FormatError(
-                    f"{keyword} of band {band} comes a second time",
+                    f"{keyword} of band {band} occurs a second time",
                     where=f"{name}, line {number}",
                     do="remove one",
                 )
@@ -135,7 +135,7 @@ def _entry(line: str, where: str) -> tuple[int, str, str, str]:
             f"the name says {name.upper()} and the keyword {keyword}", where=where, do="correct one"
         )
     if not _KEYWORD.fullmatch(keyword):
-        raise FormatError(f"{keyword} is no keyword of SIP", where=where, do="correct the keyword")
+        raise FormatError(f"{keyword} is not a SIP keyword", where=where, do="correct the keyword")
     if int(band) not in ARRAYS:
         raise FormatError(f"band {band} is none of 1 to 4", where=where, do="correct the band")
     return int(band), keyword, value, " ".join(comment.split())
@@ -161,7 +161,7 @@ def _wise_band(
             header[keyword] = int(value) if keyword.endswith("_ORDER") else float(value)
         except ValueError:
             raise FormatError(
-                f"value {value!r} is no finite number",
+                f"value {value!r} is not a finite number",
                 where=f"{where}, keyword {keyword}",
                 do="correct the value",
             ) from None

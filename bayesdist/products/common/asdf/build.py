@@ -67,7 +67,7 @@ def chip_transforms(
             raise InputError(
                 "the inverse of its look-up tables does not converge",
                 where=where,
-                do="check the tables: they move pixels over each other",
+                do="check the tables: they change the order of neighbouring pixels",
             )
         model.inverse = back
         date = options.epoch if calibration.model.time is not None else None
@@ -81,7 +81,7 @@ def refuse_larger(one: ChipTransform, name: str, known: Detector | None, where: 
     if known is not None and any(a > b for a, b in zip(chip.size, known.size, strict=True)):
         (nx, ny), (most_x, most_y) = chip.size, known.size
         raise InputError(
-            f"the chip has {nx:g} x {ny:g} pixels, and {name} {most_x:g} x {most_y:g}",
+            f"the chip has {nx:g} x {ny:g} pixels, but {name} {most_x:g} x {most_y:g}",
             where=where,
             do="name the detector that it is",
         )

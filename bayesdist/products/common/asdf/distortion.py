@@ -93,13 +93,13 @@ def transform_in(tree: Mapping[str, Any], key: str, where: str) -> Model:
             "a list of models" if isinstance(model, (list, tuple)) else f"no model ({model!r})"
         )
         raise FormatError(
-            f"{key} holds {content}, which is no map of a detector's pixels"[:200],
+            f"{key} holds {content}, which is not a map of a detector's pixels"[:200],
             where=where,
             do="give a distortion reference file of an imager",
         )
     if (model.n_inputs, model.n_outputs) != (2, 2):
         raise FormatError(
-            f"{key} takes {model.n_inputs} coordinates to {model.n_outputs}, and not 2 to 2",
+            f"{key} takes {model.n_inputs} coordinates to {model.n_outputs} instead of 2 to 2",
             where=where,
             do="give a distortion reference file of an imager",
         )
@@ -182,7 +182,7 @@ def distortion_calibration(file: DistortionFile, choice: Choice) -> Calibration:
         raise InputError(
             "its look-up tables are not arranged as bayesdist does"
             if tables
-            else "its transform is no polynomial",
+            else "its transform is not a polynomial",
             where=file.name,
             do="give a polynomial, or a file with a bayesdist record",
         )
@@ -232,7 +232,7 @@ def _chip_number(file: DistortionFile) -> int:
 
 def _no_size(name: str) -> MissingSizeError:
     return MissingSizeError(
-        "does not say how large the image is, and its detector is not known here",
+        "does not state the size of the image, and its detector is not known",
         where=name,
-        do="compare it with a file that says",
+        do="compare it with a file that states it",
     )

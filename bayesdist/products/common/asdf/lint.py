@@ -68,7 +68,7 @@ def _units(file: DistortionFile) -> Iterator[Finding]:
         if unit and unit not in wanted:
             yield Finding(
                 "error", f"meta.{name}",
-                f"units are {unit!r}; pipelines take pixels to arcsec whatever stands here",
+                f"units are {unit!r}; pipelines convert pixels to arcsec regardless of this entry",
             )  # fmt: skip
         elif not unit:
             yield Missing(f"meta.{name}", f"; it should be {wanted[0]!r}", "warning").finding
@@ -108,7 +108,7 @@ def _inverse(file: DistortionFile) -> Iterator[Finding]:
     if back is None:
         yield Missing(
             "inverse",
-            ": gwcs cannot go from the sky to pixels, and pipelines stop where they must",
+            ": gwcs cannot transform the sky to pixels, so pipelines fail where they need it",
         ).finding
         return
     x, y = file.grid()
@@ -145,7 +145,7 @@ def _repeated(model: Model) -> Iterator[Finding]:
 def _record(file: DistortionFile) -> Iterator[Finding]:
     """Findings about the record written by bayesdist."""
     if file.record is None:
-        yield Finding("note", "bayesdist", "is not there: the file states no uncertainty")
+        yield Finding("note", "bayesdist", "is missing: the file states no uncertainty")
         return
     stored = file.record
     yield from record(

@@ -150,7 +150,7 @@ rolls = [0, 90]
         ("offsets = [[7, 7]]", "", ["'not moved'", "one of the three"]),
         ("exposures = 4", "scales = {}", ["'not moved'", "one of the three"]),
         ("offsets = [[7, 7]]\nexposures = 4", "scales = {}", ["'not moved'", "number of exp"]),
-        ("offsets = [[7, 7]]\n", 'scales = {}\nunit = "detector"\n', ["leave the unit out"]),
+        ("offsets = [[7, 7]]\n", 'scales = {}\nunit = "detector"\n', ["leave out the unit"]),
         ("[-100, 60, 60]", "[-100, 60, 60, 1]", ["pattern[2].offsets[5]"]),
         ("130]]", "130]]\nrolls = [0, 90]", ["'listed'", "give one of the two"]),
         ("[model]", '[selfcal]\nframes = "shift"\n\n[model]', ["'listed' has rolls", "'shift'"]),

@@ -264,7 +264,7 @@ def test_other_commands(three_rolls, tmp_path):
     for arguments, word in (
         (("select-order", three_rolls.config), "is a self-calibration"),
         (("monitor", run, run), "is the released run itself"),
-        (("monitor", run, run / "stars.ecsv"), "has no [data]"),
+        (("monitor", run, run / "stars.ecsv"), "has no section [data]"),
         (("wise", "bands", run, "-o", tmp_path / "bands"), "self-calibration"),
         (("plan", run), "has no requirements"),
         (("plan", run, "--epochs", "2020"), "self-calibration"),
