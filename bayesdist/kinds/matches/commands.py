@@ -36,9 +36,9 @@ def init(config: str, matches: str | None, **options: Any) -> None:
         toml = Path(config).with_suffix(".toml").name
         table = config if toml != Path(config).name else "stars.csv"
         raise click.UsageError(
-            f"--matches names the table: bayesdist init {toml} --matches {table}. A row of it is a "
-            "star with its pixels and its reference position; match two lists first (bayesdist "
-            "docs your_table). Of one list without reference positions a draft is written."
+            f"--matches names the table: bayesdist init {toml} --matches {table}. Each row is a "
+            "star with its pixel and its reference position; match two lists first (bayesdist "
+            "docs your_table). A list without reference positions gives a draft."
         )
     from bayesdist.kinds.matches.init import init as write_configuration
 

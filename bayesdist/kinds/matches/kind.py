@@ -81,7 +81,7 @@ class MatchesKind(RunKind[MatchesConfig, Matches]):
         errors = load_errors(release.directory.path).by_magnitude
         if errors is None:
             raise InputError(
-                "errors by magnitude are asked for, and the run has measured none",
+                "errors by magnitude are requested, but the run has measured none",
                 where=", ".join(matches.sources),
                 do="give data.sigma another value",
             )
