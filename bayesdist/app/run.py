@@ -139,7 +139,7 @@ class Run:
 
     @cached_property
     def held_out(self) -> Matches | None:
-        """Stars that were set aside to test the result, as `matches`; None if there are none."""
+        """Held-out stars, in the form of `matches`; None if there are none."""
         held = self.held_stars
         return None if held is None else self.errors.applied(self.as_placed(held))
 
@@ -590,7 +590,7 @@ class Run:
 
     @cached_property
     def inputs(self) -> Any:
-        """Inputs of the run: matched stars, or star lists with what belongs to them."""
+        """Inputs of the run: matched stars, or star lists with their catalogue and exposure log."""
         if "inputs" in self.made:
             return self.made["inputs"]
         if self.source is not None:
@@ -609,7 +609,7 @@ class Run:
 
     @property
     def stars(self) -> Matches:
-        """Stars to fit as they were matched, with quoted errors; `matches` as the fit used them."""
+        """Stars to fit as matched, with quoted errors; `matches` has them as the fit used them."""
         stars: Matches = self._matched["stars"]
         return stars
 
@@ -630,7 +630,7 @@ class Run:
 
     @property
     def match_table(self) -> Table | None:
-        """Matching of star lists, one row per exposure; None if it was not made now."""
+        """Matching of star lists, one row per exposure; None unless this process matched them."""
         return self._matched.get("match_table")
 
     @property
@@ -855,7 +855,7 @@ class Run:
 
     @cached_property
     def report_data(self) -> Any:
-        """What the figures of this kind of run draw in addition; None if there is nothing."""
+        """Additional data that the figures of this kind of run draw; None if there are none."""
         return self.kind.report_data(self)
 
     @property

@@ -211,7 +211,7 @@ class DrawnErrors:
         )
 
     def worst(self, domain: EvaluationDomain, axis: str = "") -> WorstPosition:
-        """Position with the largest error; for a difference, the one of the two that is worse.
+        """Position with the largest error, among both positions of each difference.
 
         `axis`: 'u' or 'v'; empty for both axes.
         """

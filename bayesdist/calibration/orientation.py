@@ -410,7 +410,7 @@ def turn_between(
 ) -> tuple[complex, bool]:
     """Scale and rotation from B to A as one complex number, and True if B is mirrored first.
 
-    `za` and `zb` are the coefficients (K,) of u + i v of both.
+    `za` and `zb` are the coefficients (K,) of u + i v of A and B.
 
     Raises InputError, with the `name` of B, if B maps the chip to one point.
     """

@@ -201,10 +201,11 @@ class ReferenceCatalog:
         return replace(self, **{**sigmas, "correlations": correlations, **changes})
 
     def with_errors_of(self, covariances: Float, jacobian: Float) -> ReferenceCatalog:
-        """Catalogue with the errors of other axes.
+        """Catalogue with errors that are transformed from other axes.
 
-        `covariances` (N, 5, 5) are those of position, parallax and motion along other axes, and
-        `jacobian` (N, 2, 2) the derivatives of u and v with respect to these.
+        `covariances` (N, 5, 5) are the covariances of position, parallax and motion along those
+        axes, and `jacobian` (N, 2, 2) the derivatives of u and v with respect to positions along
+        them.
         """
         turn = np.tile(np.eye(len(_SIGMAS)), (len(self), 1, 1))
         turn[:, :2, :2] = turn[:, 3:, 3:] = jacobian

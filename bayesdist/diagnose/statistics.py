@@ -55,9 +55,10 @@ def add_over(total: Float, cluster: Int, values: Float) -> None:
 
 
 def joint_clusters(group: Int, cluster: Int) -> tuple[Int, Int]:
-    """Split clusters by group: the group (c,) of each part, and the part (N,) of each value.
+    """Split clusters by group.
 
-    `group` and `cluster` (N,) must not be negative.
+    `group` and `cluster` (N,) must not be negative.  Returns the group (c,) of each of the c parts,
+    and the part (N,) of each value.
     """
     n = int(cluster.max(initial=0)) + 1
     keys, of = np.unique(group * n + cluster, return_inverse=True)

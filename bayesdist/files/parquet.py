@@ -130,9 +130,9 @@ def _page_header(stream: BinaryIO, at: int, budget: Budget) -> tuple[dict[int, i
 
 
 def _thrift_struct(raw: bytes, at: int = 0, depth: int = 0) -> tuple[dict[int, int], int]:
-    """Integers of a struct in Thrift's compact protocol by field, and the place of its end.
+    """Integers of a struct in Thrift's compact protocol by field, and the offset of its end.
 
-    IndexError where `raw` ends before the struct, ValueError for what is no such struct.
+    Raises IndexError if `raw` ends before the struct does, and ValueError if it is not a struct.
     """
     numbers, field = dict[int, int](), 0
     while raw[at]:
@@ -150,7 +150,7 @@ def _thrift_struct(raw: bytes, at: int = 0, depth: int = 0) -> tuple[dict[int, i
 
 
 def _thrift_integer(raw: bytes, at: int) -> tuple[int, int]:
-    """Signed integer and the place after it: 7 bits in each byte, and the sign in the lowest."""
+    """Signed integer and the offset after it: 7 bits per byte, with the sign in the lowest bit."""
     value, at = _thrift_varint(raw, at)
     return (value >> 1) ^ -(value & 1), at
 
@@ -166,7 +166,7 @@ def _thrift_varint(raw: bytes, at: int) -> tuple[int, int]:
 
 
 def _after_thrift_value(raw: bytes, at: int, kind: int, depth: int) -> int:
-    """Place after a value that is no integer: a boolean, byte, double, text or struct."""
+    """Offset after a value other than an integer: a boolean, byte, double, string or struct."""
     if kind in (1, 2):  # the kind is the value
         return at
     if kind == 8:

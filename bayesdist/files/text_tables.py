@@ -311,7 +311,7 @@ def refuse_foreign_numbers(
     """Raise FormatError for cells that Python or C reads as numbers but no table format allows.
 
     These are digits with underscores ("1_00"), hexadecimal numbers ("0x64"), digits of other
-    scripts, and numbers beside blanks that are not ASCII, such as U+00A0. `columns`: True for each
+    scripts, and numbers next to blanks that are not ASCII, such as U+00A0. `columns`: True for each
     column of numbers, in the order of the file. `lines`: lines of the table, with cells separated
     by `mark`, or by blanks or the bars of an IPAC table. In text columns such cells are allowed.
     """

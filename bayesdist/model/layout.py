@@ -395,7 +395,7 @@ class ParameterLayout:
 
     @property
     def local_blocks(self) -> tuple[slice, ...]:
-        """Local blocks of theta, one per exposure except the first."""
+        """Slices of theta with the frame parameters of each exposure except the first."""
         if not self.n_frame:
             return ()
         return tuple(self.frame_slice(e) for e in range(1, len(self.exposures)))

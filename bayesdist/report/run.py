@@ -49,7 +49,7 @@ class ReportedKind(Protocol):
 
 
 class ReportedRun(Protocol):
-    """What the report and the plots read of a run; `bayesdist.Run` has more."""
+    """Members of a run that the report and the plots use; `bayesdist.Run` has more."""
 
     @property
     def title(self) -> str:
@@ -109,7 +109,7 @@ class ReportedRun(Protocol):
 
     @property
     def report_data(self) -> Any:
-        """What the figures of this kind of run draw in addition; None if there is nothing."""
+        """Additional data that the figures of this kind of run draw; None if there are none."""
 
     @property
     def summary(self) -> Mapping[str, Any]:

@@ -80,7 +80,7 @@ class LazyGroup(click.Group):
 
     @staticmethod
     def checked(command: object, where: str) -> click.Command:
-        """Return the command; InputError if the object is none."""
+        """Return the command; raises InputError if the object is not a command."""
         if not isinstance(command, click.Command):
             raise InputError(
                 "is not a command", where=where, do="correct the package that registers it"

@@ -163,7 +163,7 @@ class ComputeBlock(Section):
 
 
 class DiscrepancyBlock(Section):
-    """Prior medians of distortion that the model may leave out."""
+    """Prior medians of errors that the model does not include; units as in `DiscrepancyPriors`."""
 
     higher_order: PositiveFloat = DiscrepancyPriors.higher_order
     structure: PositiveFloat = DiscrepancyPriors.structure

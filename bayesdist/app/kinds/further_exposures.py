@@ -39,7 +39,7 @@ class FurtherExposures:
         return "does not depend on time, so that the dates of further exposures do not matter"
 
     def sentence(self, content: ExposureContent) -> str:
-        """Sentence on the exposures that are assumed."""
+        """Sentence that states which exposures are assumed."""
         return f"An exposure is taken to hold {content.n_stars:.0f} matched stars as these do."
 
     def schedules(

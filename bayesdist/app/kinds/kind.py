@@ -51,7 +51,7 @@ class Outline:
 
 @dataclass(frozen=True, eq=False)
 class Questions:
-    """What the general diagnostics have to know of the fit of a run."""
+    """Properties of the fit of a run that the general diagnostics need."""
 
     # centroid errors, if the fit has estimated them; else they are the scatter of the residuals
     centroid: MagnitudeErrors | Literal["residuals"] | None = "residuals"
@@ -140,11 +140,11 @@ class RunKind(ABC, Generic[C, I]):
         """Raise InputError if inputs are inconsistent."""
 
     def lines(self, inputs: I) -> Iterator[str] | None:
-        """Lines that the command `check` prints; None if those about the fit say more."""
+        """Lines that the command `check` prints; None to print lines about the fit instead."""
         return None
 
     def outline(self, inputs: I) -> Outline | None:
-        """Shape of the solution, to make products on trial before stars are matched.
+        """Shape of the solution, for a trial export of the products before stars are matched.
 
         None if the fit is used for that.
         """
@@ -157,7 +157,7 @@ class RunKind(ABC, Generic[C, I]):
     # -- from the posterior on --------------------------------------------------------------------
 
     def questions(self, run: Run) -> Questions:
-        """What the general diagnostics have to know of a fit."""
+        """Properties of a fit that the general diagnostics need."""
         return Questions()
 
     def overlap(self, run: Run) -> OverlapTest | None:
@@ -184,7 +184,7 @@ class RunKind(ABC, Generic[C, I]):
         return replace(prediction, local=local, cell=(side, side), local_in_noise=True)
 
     def error_terms(self, run: Run, solution: Solution) -> list[ErrorTerm]:
-        """Errors of positions beside those of the solution: those that the user states."""
+        """Error terms in addition to those of the solution, by default those stated by the user."""
         return [*run.config.linear_terms(solution), *self.stated_terms(run, solution)]
 
     def stated_terms(self, run: Run, solution: Solution) -> list[ErrorTerm]:
@@ -219,7 +219,7 @@ class RunKind(ABC, Generic[C, I]):
         return frozenset()
 
     def report_data(self, run: Run) -> Any:
-        """What the figures of this kind draw in addition to the artefacts of a run.
+        """Data that the figures of this kind draw in addition to the artefacts of a run.
 
         Processes that draw receive it instead of the inputs.
         """

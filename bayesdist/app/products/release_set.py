@@ -77,7 +77,7 @@ def release_set() -> ReleaseSet:
 def first_segments(
     block: ReleaseBlock, sets: Mapping[str, Calibration], n_segments: int
 ) -> list[Calibration]:
-    """Calibrations of a release, one per segment; of several periods of a segment the first."""
+    """Calibrations of a release, one per segment; that of the first period of each segment."""
     segments: dict[int, Calibration] = {}
     for period in block.period:
         segments.setdefault(period.segment, sets[period.name])

@@ -73,6 +73,11 @@ def refuse_another_solution(
         SHA-256 of the inputs by name.
     seed : int or None
         Seed given on the command line.
+
+    Raises
+    ------
+    InputError
+        If a setting, the seed or an input differs.
     """
     path = folder / "config.toml"
     if seed is not None and seed != known.sampler.seed:

@@ -132,9 +132,9 @@ class Scattering:
         return np.asarray((size[rows] / np.maximum(size, 1e-300))[:, None, None] * error)
 
     def chosen(self, n: int, data: ExistingData, truth: int, rng: np.random.Generator) -> Int:
-        """Indices (DRAWS,) of draws that are probable after n more exposures if `truth` is true.
+        """Indices (DRAWS,) of draws that are probable after n more exposures, given the truth.
 
-        `truth` is the index of a draw.
+        `truth` is the index of the draw that is taken as the truth.
 
         Deviations are measured with the precision that the stars of an exposure allow. The
         likelihood uses the sum of all scatters, with as many degrees of freedom as there are large

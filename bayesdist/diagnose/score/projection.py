@@ -443,7 +443,7 @@ def _added(block: DetectionBlock, n_added: int, n_terms: int, which: Int) -> Flo
 
 
 def contracted(A: Float, B: Float) -> Float:
-    """Sum products over axes and functions: arrays (2, L, m) and (2, L, n) give (m, n)."""
+    """Products (m, n) of A (2, L, m) and B (2, L, n), summed over axes and functions."""
     return A.reshape(-1, A.shape[2]).T @ B.reshape(-1, B.shape[2])
 
 

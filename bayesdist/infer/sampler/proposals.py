@@ -1,4 +1,4 @@
-"""What the ensembles are made of: batches of proposals, whitened coordinates, and checkpoints.
+"""Building blocks of the ensembles: batches of proposals, whitened coordinates, checkpoints.
 
 Independence proposals do not depend on the walkers, so that one pass over the data serves many
 steps of all ensembles.  Each ensemble and batch has a separate stream of random numbers, so that

@@ -155,7 +155,7 @@ def walkers_for(n_stars: int) -> int:
 
 
 def pilot_steps(ensembles: int, walkers: int) -> int:
-    """Number of steps for which the pilot provides proposals, besides the starting points."""
+    """Number of steps for which the pilot provides proposals, not counting the starting points."""
     return max(15, -(-PILOT // (ensembles * walkers)) - 1)
 
 

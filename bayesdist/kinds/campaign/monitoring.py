@@ -42,6 +42,12 @@ def fit_new_exposures(release: Run, new: Path) -> tuple[Matches, NewFit, tuple[s
         Their fit.
     tuple of str
         Exposures that are left out because the release was made from them.
+
+    Raises
+    ------
+    InputError
+        If pairs have no epochs, are in another filter or unit than the release, or are all of
+        exposures that the release was made from, or if star lists are not matched yet.
     """
     run = RunDirectory(new) if (new / "run.json").exists() else None
     released, config = release.solution, release.config

@@ -58,6 +58,12 @@ def release_runs(
     -------
     str
         Text to print.
+
+    Raises
+    ------
+    InputError
+        If a folder is not a run of a campaign, two runs have the same filter, settings or tables of
+        the detector differ between the runs, or a run has not converged.
     """
     with ExitStack() as stack:
         by_filter: dict[str, Run] = {}

@@ -30,7 +30,7 @@ ONE_AXIS = 0.5**0.5  # converts a radius hypot(sigma_u, sigma_v) to an error per
 
 @dataclass(frozen=True, eq=False)
 class SelfcalData:
-    """What the figures and tables show in addition to the artefacts of the run."""
+    """Data that the figures and tables show in addition to the artefacts of the run."""
 
     gauge_words: str  # description of the gauge
     gauge: Table  # content of gauge.ecsv

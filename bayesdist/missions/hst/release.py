@@ -356,7 +356,11 @@ def _check(
 def read_calibrations(
     entries: Sequence[Mapping[str, Any]], folder: Path, filter: str
 ) -> dict[str, Calibration]:
-    """Calibrations with look-up tables of a filter, by the names of their periods."""
+    """Read the calibrations of a filter, with look-up tables, from the files of a release.
+
+    `entries` describe the files: their kind, path in `folder` and period. The result has one
+    calibration per period, by its name.
+    """
     paths = {entry["kind"]: folder / entry["path"] for entry in entries}
     before = read_d2im(paths["D2IMFILE"]) if "D2IMFILE" in paths else ()
     npol = read_lookup_file(paths["NPOLFILE"]) if "NPOLFILE" in paths else None

@@ -347,7 +347,7 @@ def record(
 
 
 def no_side_file(where: str, name: str, description: str = "the covariance") -> Finding:
-    """Warning that the file with the covariance is not beside the file that names it."""
+    """Warning that the covariance file is missing from the folder of the file that names it."""
     return Finding("warning", where, f"{name}, {description}, is missing")
 
 

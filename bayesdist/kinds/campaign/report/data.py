@@ -104,7 +104,7 @@ class LinearSeries:
 
 @dataclass(frozen=True, eq=False)
 class CampaignData:
-    """What the figures and tables of a campaign show in addition to the artefacts of its run."""
+    """Data that figures and tables of a campaign show in addition to the artefacts of its run."""
 
     filter: str
     matching: Table  # content of matching.ecsv

@@ -147,7 +147,7 @@ class ArrayCheck:
         *,
         reference: tuple[Float, Float] | None = None,
     ) -> None:
-        """Add a batch; raises InputError if a detection is outside of the array.
+        """Add a batch of pairs to the check.
 
         Parameters
         ----------
@@ -157,6 +157,11 @@ class ArrayCheck:
             Function that maps an index into x and y to the file and row named in messages.
         reference : tuple of ndarray, shape (N,), optional
             u and v, if these are in pixels of the array.
+
+        Raises
+        ------
+        InputError
+            If a detection is outside of the array.
         """
         for name, values, extent in (("x", x, self.size[0]), ("y", y, self.size[1])):
             # tolerance of half a pixel, since centroids may be slightly outside of the array

@@ -48,6 +48,12 @@ def read_solutions(
     -------
     dict of str to RvbTransform
         Solutions by frame.
+
+    Raises
+    ------
+    InputError
+        If the table has no column of frames or of parameters, a frame occurs twice, or the unit of
+        the rotation is not an angle.
     """
     file = Path(path)
     table = read_table(file)

@@ -128,6 +128,8 @@ def test_a_filter_for_each_segment_is_no_break(rng):
     one = series(rng)
     group = tuple(np.where(one.epoch < BREAKS[0], "F606W", "F814W"))
     mixed = Series.of(one.epoch, one.values, coefficients=("a", "b"), group=group)
-    with pytest.raises(DegenerateError, match=r"F606W\) cannot be told from the trend 'step"):
+    with pytest.raises(
+        DegenerateError, match=r"F606W\) cannot be distinguished from the trend 'step"
+    ):
         Design(TrendModel("step", BREAKS[:1]), mixed)
     assert Design(TrendModel("line"), mixed).n_columns == 3
