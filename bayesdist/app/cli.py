@@ -45,11 +45,11 @@ RENAMED = {
     "order": "select-order",
 }
 EPILOG = (
-    "Exit codes: 0 all went well; 1 the input is wrong, and the message says what to mend; 2 the "
-    "command was not understood; 3 the sampler did not converge and --strict was given; 4 a "
-    "requirement is missed; 5 none is missed, but one is neither shown to be met nor missed; 6 one "
-    "cannot be judged because something is in doubt; 65 the input is nested too deep; 70 a bug of "
-    "bayesdist: please report it; 71 the memory is too small; 74 a file cannot be read or written; "
+    "Exit codes: 0 success; 1 invalid input (the message states what to correct); 2 invalid "
+    "command line; 3 the sampler did not converge and --strict was given; 4 a requirement is "
+    "missed; 5 no requirement is missed, but one is not shown to be met; 6 a requirement is "
+    "undecided because something is in doubt; 65 the input is nested too deeply; 70 a bug of "
+    "bayesdist: please report it; 71 not enough memory; 74 a file cannot be read or written; "
     "130 interrupted by the user; 143 terminated by the system or a batch queue."
 )
 

@@ -180,7 +180,7 @@ def refuse_unknown_scale(
     """Raise InputError if u and v are in pixels of unknown scale and the file states angles."""
     if calibration.unit == "pix" and scale is None and target.needs_scale(settings):
         raise InputError(
-            f"is in pixels of unknown size, but {target.title} stores angles",
+            f"is in pixels of unknown size, but writing {target.title} requires angles",
             where=calibration.name,
             do="give the pixel scale (scale_mas in Python, --scale of convert)",
         )

@@ -173,7 +173,7 @@ def test_bad_requests_get_a_sentence(tmp_path):
         ),
         ((path, "--to", "tpv", "--option", "crval", *new), "is not KEY=VALUE"),
         ((path, "--to", "jwst", *new), "needs useafter, pedigree, author, instrument"),
-        ((notes, "--to", "jwst", *new), "notes.txt: is an unknown format"),
+        ((notes, "--to", "jwst", *new), "notes.txt: has an unknown format"),
         (
             (pixels, "--to", "siaf", "--option", "aperture=A", *new),
             "give the pixel scale (scale_mas in Python, --scale of convert)",

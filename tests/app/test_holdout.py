@@ -154,7 +154,7 @@ def test_whole_exposures_are_drawn_and_predicted(tmp_path):
         ({}, ("holds nothing out",)),
         ({"fraction": 0.01}, ("too few to judge", "holdout.fraction")),
         ({"exposures": ["nobody"]}, ("nobody",)),
-        ({"exposures": 3}, ("there are 1",)),
+        ({"exposures": 3}, ("there are only 1",)),
         ({"fraction": 0.95}, ("holdout.fraction",)),
         ({"fractoin": 0.1}, ("fractoin", "fraction")),
     ],

@@ -78,7 +78,7 @@ CASES: dict[str, tuple[Callable[[], Table], dict[str, Any], list[str]]] = {
     "W1 on the detector of W4": (w1, {"data": {"band": "W1"}}, ["array of W1 has 1016", "508"]),
     "another array": (w1, {"detector": {"name": "W1", "size": (1024, 1024)}}, ["1016 x 1016"]),
     "no errors": (_without("sigma_u", "sigma_v"), {}, ["pairs", "errors"]),
-    "one error": (_without("sigma_v"), {}, ["'sigma_v' is missing"]),
+    "one error": (_without("sigma_v"), {}, ["'sigma_v' is given without its partner"]),
     "no u": (_without("u"), {}, ["no column for 'u'"]),
     "no frames": (
         _without("frame"),

@@ -57,7 +57,7 @@ print([m for m in {heavy!r} if m in sys.modules], file=sys.stderr)
 """
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert run.stderr.strip() == "[]"
-    assert "Exit codes: 0 all went well; 1 the input is wrong" in run.stdout
+    assert "Exit codes: 0 success; 1 invalid input" in run.stdout
 
 
 def test_a_file_is_inspected_without_what_only_other_files_need(tmp_path):

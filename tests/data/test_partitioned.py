@@ -252,7 +252,7 @@ def test_what_takes_stars_in_memory_says_so(rng, tmp_path):
     one = np.full(500, 0.1)
     for call, message in (
         (lambda: opened.x, "the stars are on disk, so their column 'x' is not in memory"),
-        (lambda: opened.epoch, "no column 'epoch'"),
+        (lambda: opened.epoch, "their column 'epoch'"),
         (lambda: opened.with_columns(x=one), "are on disk"),
         (lambda: opened.select([1, 2]), "can only be selected by a mask"),
         (lambda: opened.select(one > 1), "holds no rows"),

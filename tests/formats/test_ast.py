@@ -95,7 +95,7 @@ def test_what_is_read_back_is_the_calibration_with_its_covariance(tmp_path):
     alone = registry.read_calibration(path)
     x, y = random_pixels(SIZE, 2000)
     off = alone.forward(x, y, chip=1) - found.forward(x, y, chip=1)
-    assert np.abs(off).max() / PIXEL < 1e-9 and "is missing" in alone.notes[0]
+    assert np.abs(off).max() / PIXEL < 1e-9 and "is not here" in alone.notes[0]
 
 
 def test_chips_are_files_of_their_own(tmp_path):
@@ -204,7 +204,7 @@ def test_bad_dumps_get_a_sentence(tmp_path, ast):
     right = path.read_text()
     for change, message in (
         (lambda t: t[: len(t) // 2], "does not end|not a line of a dump"),
-        (lambda t: t.replace("End PolyMap", "End ZoomMap"), "ends a ZoomMap and not the PolyMap"),
+        (lambda t: t.replace("End PolyMap", "End ZoomMap"), "ends a ZoomMap but not the PolyMap"),
         (lambda t: t.replace("CF3 =", "CX3 ="), "CF3 of the PolyMap is missing"),
         (lambda t: t.replace("NCF1 = 10", "NCF1 = many"), "no number"),
         (lambda t: t.replace("Begin WinMap", "Begin PcdMap").replace("End WinMap", "End PcdMap"),

@@ -30,8 +30,8 @@ def test_a_header_that_makes_sense(tmp_path):
 @pytest.mark.parametrize(
     ("changed", "words"),
     [
-        ({"CRVAL1": 0.0, "CRVAL2": 91.0}, "on no sphere"),
-        ({"CRVAL1": 1e9, "CRVAL2": 1e9}, "on no sphere"),
+        ({"CRVAL1": 0.0, "CRVAL2": 91.0}, "not a position on the sphere"),
+        ({"CRVAL1": 1e9, "CRVAL2": 1e9}, "not a position on the sphere"),
         ({"CRPIX1": 1e9}, "reference pixel at"),
         ({"A_2_0": 1e9}, "linear terms"),
         ({"CD1_1": 0.0}, "without an area|linear terms"),

@@ -338,7 +338,7 @@ def test_an_unknown_aperture_needs_a_size(calibration):
         if not line.startswith("# XSci") and not line.startswith("# YSci")
     )
     document = registry.recognized(Content("table.txt", text.encode()))
-    assert "size of the detector is not known" in document.describe()
+    assert "size of the detector is unknown" in document.describe()
     with pytest.raises(InputError, match="MADE_UP is not a known full frame"):
         document.calibration()
     assert document.calibration(Choice(size=SIZE)).model.chips[0].size == SIZE

@@ -241,7 +241,7 @@ IN_PIXELS = calibration_of(some_solution(4), "camera")
         ("sip", {"scale_mas": 50, "linear": "all"}, r"sip.linear: .*the settings of sip"),
         ("parameters", {"colour": 1}, "parameters has no settings"),
         ("idctab", {"scale_mas": 50}, "products.idctab: needs instrument, detector"),
-        ("tpv", {}, "camera: is in pixels of unknown size, and TPV headers"),
+        ("tpv", {}, "camera: is in pixels of unknown size, but writing TPV headers"),
         ("sip", {}, "give the pixel scale .scale_mas in Python"),
         ("ast", {}, "give the pixel scale"),
         ("cpdis", {}, "give the pixel scale"),

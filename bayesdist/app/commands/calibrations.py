@@ -80,8 +80,12 @@ def inspect() -> None:
     show_default="0 0",
     help="Output pixel of the zero point.",
 )
-@click.option("--vafactor", type=float, default=1.0, metavar="V", help="Factor of aberration.")
-@click.option("--sky", is_flag=True, help="To the sky: ra, dec with all errors that FILE carries.")
+@click.option(
+    "--vafactor", type=float, default=1.0, metavar="V", help="Factor of velocity aberration."
+)
+@click.option(
+    "--sky", is_flag=True, help="Transform to the sky: ra, dec with all errors stated in FILE."
+)
 @click.option(
     "--point", nargs=2, type=float, metavar="RA DEC", help="With --sky: position of u, v = 0."
 )
@@ -95,7 +99,7 @@ def inspect() -> None:
     help="Coordinate of the first pixel's centre (default: that of the columns' program, or 1).",
 )
 @click.option(
-    "--image", type=click.Path(), metavar="FLT", help="A calibrated image whose pixels these are."
+    "--image", type=click.Path(), metavar="FLT", help="Calibrated image that the pixels belong to."
 )
 @click.option("--ltv", nargs=2, type=float, metavar="LTV1 LTV2", help="LTV keywords of a subarray.")
 @click.option("--corner", nargs=2, type=float, metavar="X Y", help="First pixel of a subarray.")
@@ -127,7 +131,11 @@ def apply(file: str, table: str, output: str, **options: Any) -> None:
 @click.argument("path", metavar="FILE", type=click.Path())
 @click.option("--to", required=True, metavar="FORMAT", help="Format to write, a key of [products].")
 @click.option(
-    "-o", "--output", type=click.Path(), metavar="OUT", help="Folder, or file where one is made."
+    "-o",
+    "--output",
+    type=click.Path(),
+    metavar="OUT",
+    help="Folder, or file if only one is written.",
 )
 @click.option(
     "--option",
@@ -137,7 +145,10 @@ def apply(file: str, table: str, output: str, **options: Any) -> None:
     help="Setting of the format, as in [products].",
 )
 @click.option(
-    "--order", type=int, metavar="N", help="Order of the polynomial, where another is wanted."
+    "--order",
+    type=int,
+    metavar="N",
+    help="Polynomial order of the output (default: that of the input).",
 )
 @click.option("--chip", type=int, metavar="N", help="Number of the only chip to convert.")
 @filter_name
@@ -168,7 +179,7 @@ def convert() -> None:
     help="Folder to create for tables and figure.",
 )
 @click.option(
-    "--chip", type=int, metavar="N", show_default="all common chips", help="Chip that is compared."
+    "--chip", type=int, metavar="N", show_default="all common chips", help="Chip to compare."
 )
 @click.option(
     "--filter", metavar="F", help="Filter or band of a file with several; F:G for A and B."

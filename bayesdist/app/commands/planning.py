@@ -42,14 +42,14 @@ def plan() -> None:
     type=int,
     default=(3, 9),
     metavar="LOW HIGH",
-    help="Lowest and highest order that are compared.",
+    help="Lowest and highest order to compare.",
 )
 @click.option(
     "--chip",
     type=int,
     metavar="N",
     show_default="the only one",
-    help="Chip that is compared.",
+    help="Chip to use.",
 )
 @click.option(
     "-o", "--output", type=click.Path(), metavar="orders.ecsv", help="Write the table to a file."

@@ -61,7 +61,7 @@ def run(line: str, config: str, output: str | None, **options: Any) -> None:
 @click.argument("name", metavar=f"[{'|'.join(STAGES)}]", type=click.Choice(STAGES))
 @click.argument("run", metavar="RUN", type=click.Path())
 @click.option("--strict", is_flag=True, help="For sample: exit with 3 unless converged.")
-@click.option("--pdf", is_flag=True, help="For report: draw the figures as PDF, too.")
+@click.option("--pdf", is_flag=True, help="For report: also draw the figures as PDF.")
 def stage(name: str, run: str, strict: bool, pdf: bool) -> None:
     """Run one stage of a run again.
 
@@ -81,13 +81,13 @@ def stage(name: str, run: str, strict: bool, pdf: bool) -> None:
     type=click.Path(),
     required=True,
     metavar="REQ.toml",
-    help="File of [[requirement]] blocks, which may be a whole configuration.",
+    help="File with [[requirement]] blocks, for example a configuration.",
 )
 def requirements(run: str, requirements: str) -> int:
     """Judge a run by requirements; exit with 0 if all are met.
 
-    Exits with 4 if one is missed; else with 6 if one is undecided, because something is in doubt;
-    else with 5, if one is not shown to be met or missed.
+    The exit code is 4 if a requirement is missed, otherwise 6 if one is undecided because something
+    is in doubt, otherwise 5 if one is not shown to be met.
     """
     from bayesdist.app.commands.on_runs.validate import validate
 
@@ -109,7 +109,7 @@ def requirements(run: str, requirements: str) -> int:
     "--at-table",
     type=click.Path(),
     metavar="FILE",
-    help="Table of positions in place of --at; it may have a column chip.",
+    help="Table of positions instead of --at; it may have a column chip.",
 )
 @click.option(
     "--columns",
@@ -135,7 +135,7 @@ def requirements(run: str, requirements: str) -> int:
 )
 @click.option("--json", "as_json", is_flag=True, help="Print every term of all positions as JSON.")
 def budget() -> None:
-    """Print the error budget of a position, of a table of them, or of a separation."""
+    """Print the error budget of a position, a table of positions, or a separation."""
 
 
 @command()
@@ -145,12 +145,12 @@ def budget() -> None:
     "--output",
     type=click.Path(),
     metavar="FILE",
-    help="The page of several runs.  [default: reports.html]",
+    help="Page to write.  [default: reports.html]",
 )
 def report(runs: tuple[str, ...], output: str | None) -> None:
     """Write one page for many runs, with status, worst margin and validity of each.
 
-    For one run without -o this draws its own report.html again, as 'bayesdist stage report RUN'.
+    With a single run and no -o, its own report.html is made again, as by 'bayesdist stage report'.
     """
     if len(runs) == 1 and output is None:
         from bayesdist.app.stages import continue_stage

@@ -77,7 +77,7 @@ def refuse_another_solution(
     Raises
     ------
     InputError
-        If a setting, the seed or an input differs.
+        If the seed, an input, or a setting that may not change differs.
     """
     path = folder / "config.toml"
     if seed is not None and seed != known.sampler.seed:

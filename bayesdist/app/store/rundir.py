@@ -238,7 +238,7 @@ class RunDirectory(ArtefactStore):
     def not_a_run_error(self) -> InputError:
         """Error for a folder that is not a run; it names the run inside the folder of a demo."""
         within = self / "run"
-        cause = "is no run: it has neither run.json nor config.toml"
+        cause = "is not a run: it has neither run.json nor config.toml"
         if not self.path.exists():
             cause = "there is no such folder"
         elif not self.path.is_dir():

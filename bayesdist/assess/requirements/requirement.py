@@ -129,7 +129,7 @@ class Requirement:
             ),
             (
                 self.separation is not None and not self.relative,
-                "a separation is of two positions, and the error is that of one",
+                "a separation needs two positions, but the error is that of one",
                 "set relative = true, or leave separation out",
             ),
             (

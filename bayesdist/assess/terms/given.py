@@ -176,7 +176,8 @@ class UserTerm:
             object.__setattr__(self, name, value)
         if self.included_in_scatter and self.kind != "random":
             raise InputError(
-                "included_in_scatter is of a random budget term, which scatters from star to star",
+                "included_in_scatter applies only to random budget terms, which vary from star to "
+                "star",
                 where=location,
                 do="leave it out",
             )

@@ -15,7 +15,7 @@ from bayesdist.app.commands.options import command, new_folder
 @click.argument("runs", nargs=-1, required=True, metavar="RUN...", type=click.Path())
 @new_folder
 @click.option(
-    "--allow-unconverged", is_flag=True, help="Release runs that have not converged, too."
+    "--allow-unconverged", is_flag=True, help="Also release runs that have not converged."
 )
 def release() -> None:
     """Write one set of files from the runs of several filters.

@@ -13,7 +13,7 @@ from bayesdist.app.commands.options import column_names, command, force
 @command(example="init camera.toml --matches stars.csv --size 2048 2048")
 @click.argument("config", metavar="CONFIG.toml", type=click.Path())
 @click.option(
-    "--matches", type=click.Path(), metavar="FILE", help="Table of matched stars; needed."
+    "--matches", type=click.Path(), metavar="FILE", help="Table of matched stars (required)."
 )
 @click.option(
     "--columns",

@@ -177,7 +177,7 @@ def test_numbers_are_those_of_the_appendix(bands) -> None:
         ("_a_1_1 1 A_1_1", "_a_2_0 1 A_2_0", "line 10: A_2_0 of band 1 occurs a second time"),
         ("_a_order 1 A_ORDER", "_a_other 1 A_OTHER", "line 5: A_OTHER is not a SIP keyword"),
         (" 1 B_ORDER", " 2 B_ORDER", "B_ORDER: is missing"),
-        (" A_ORDER i 4", " A_ORDER i four", "value 'four' is no finite number"),
+        (" A_ORDER i 4", " A_ORDER i four", "value 'four' is not a finite number"),
     ],
 )
 def test_broken_lines_are_named(tmp_path, old: str, new: str, message: str) -> None:
