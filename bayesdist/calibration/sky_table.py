@@ -151,7 +151,7 @@ def pixel_columns(
         )
         if unit is not None and unit != units.pix:
             raise InputError(
-                f"unit is {unit}, and detector positions are in pix",
+                f"unit is {unit}, but detector positions are in pix",
                 where=f"{where}, column {name!r}",
                 do="name the columns of raw pixels",
             )

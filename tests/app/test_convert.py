@@ -181,8 +181,8 @@ def test_bad_requests_get_a_sentence(tmp_path):
         ((path, "--to", "siaf", *new), "(--option aperture=NIS_CEN of convert)"),
         ((path, "--to", "wise_meta", *new), "give a run whose detector.name is the band"),
         ((path, "--to", "tpv", "--order", 11, *new), "choose one from 1 to 7 for TPV headers"),
-        ((high, "--to", "tpv", *new), "up to order 7"),
-        ((pixels, "--to", "tpv", *new), "is in pixels of unknown size, and TPV headers"),
+        ((high, "--to", "tpv", *new), "limited to order 7"),
+        ((pixels, "--to", "tpv", *new), "is in pixels of unknown size, but writing TPV headers"),
         ((path, "--to", "tpv", "--scale", -1, *new), "give a positive number"),
         ((tmp_path / "none", "--to", "tpv", *new), "there is no such file"),
     ):

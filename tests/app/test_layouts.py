@@ -145,7 +145,7 @@ def test_a_star_list_becomes_a_draft_that_can_be_used(tmp_path, name, write):
     assert "incomplete draft: no columns are known as reference positions" in out
     text = config.read_text()
     assert "size = [2048, 1024]" in text
-    refused(tmp_path, "check", config, words=["there is one exposure"])
+    refused(tmp_path, "check", config, words=["there is only one exposure"])
     config.write_text(text.replace(f'lists = "0{name}"', f'lists = "?{name}"'))
     out = good("check", config).out
     assert "exposures    3" in out and "stars        " in out

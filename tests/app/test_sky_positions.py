@@ -310,7 +310,7 @@ def test_a_crval_that_cannot_be_is_refused(calibration, to, plane, unit, crval, 
 @pytest.mark.parametrize("unit", [units.arcsec, units.mm, units.deg])
 def test_positions_that_are_no_pixels_are_refused(calibration, unit):
     rows = QTable({"x": [1.0] * units.pix, "y": [2.0] * unit, "chip": [1]})
-    with pytest.raises(InputError, match=f"column 'y': unit is {unit}, and .* are in pix; name"):
+    with pytest.raises(InputError, match=f"column 'y': unit is {unit}, but .* are in pix; name"):
         calibration.to_sky(rows)
     rows["y"] = [2.0] * units.pix
     assert np.isfinite(calibration.to_sky(rows)["ra"][0])

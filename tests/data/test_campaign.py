@@ -320,7 +320,7 @@ def test_wrong_arguments_are_named(rng):
     catalog, lists, log, _, _ = campaign(rng, 2, stars=3000)
     with pytest.raises(InputError, match=r"e1\.parquet: exposure e1 is not in exposure log"):
         match_campaign(lists, log.select(names=["e0"]), catalog, start)
-    with pytest.raises(InputError, match="exposure e0 has a list in"):
+    with pytest.raises(InputError, match="exposure e0 also has a list in"):
         match_campaign((lists[0], lists[0]), log, catalog, start)
     with pytest.raises(InputError, match="no star lists"):
         match_campaign((), log, catalog, start)

@@ -236,7 +236,7 @@ def test_long_lines_many_lines_many_cells_and_many_columns(tmp_path):
     path.write_text("# " + 100 * "a" + "\nx,y\n" + 200 * "1,2\n")
     assert len(read_table(path)) == 200
     for limits, words in [
-        (Limits(line=50), "line 1: has 103 characters, and at most 50 are read"),
+        (Limits(line=50), "line 1: has 103 characters, but at most 50 are read"),
         (Limits(rows=100, rows_per_byte=0), "holds 202 rows in a file of"),
         (Limits(columns=1), "has more than 1 columns"),
     ]:

@@ -48,7 +48,7 @@ def written(folder, end, cell, exposure="1_00"):
 @pytest.mark.parametrize("end", [".csv", ".tsv", ".dat", ".ecsv", ".tbl", ".vot"])
 @pytest.mark.parametrize("cell", ["1_00", "１００", "٣", "0x1A", "0x1p3", "1e1_0", "1_0.5"])
 def test_what_no_table_has_for_a_number_is_refused(tmp_path, end, cell):
-    with pytest.raises(InputError, match=r"no number|a number must be|cannot be read"):
+    with pytest.raises(InputError, match=r"not a number|cannot be read"):
         read_matches(written(tmp_path, end, cell), unit="pix", sigma=0.01)
 
 
@@ -56,7 +56,7 @@ def test_what_no_table_has_for_a_number_is_refused(tmp_path, end, cell):
 @pytest.mark.parametrize("cell", ["\u00a02.5", "2.5\u00a0", "\u20032.5", "2.5\u3000"])
 def test_blanks_of_other_scripts_are_no_part_of_a_number(tmp_path, end, cell):
     """Python strips U+00A0, which spreadsheets write between thousands, as it strips spaces."""
-    with pytest.raises(InputError, match=r"no number|a number must be|cannot be read"):
+    with pytest.raises(InputError, match=r"not a number|cannot be read"):
         read_matches(written(tmp_path, end, cell), unit="pix", sigma=0.01)
     if end in (".csv", ".tsv", ".dat"):
         spaced = read_matches(written(tmp_path, end, " 2.5 "), unit="pix", sigma=0.01)
@@ -107,5 +107,5 @@ def test_numbers_are_those_of_python(text):
 
 @pytest.mark.parametrize("text", ["", "1_0", "0x1", "１", "1 2", "1e", "e5", ".", "1d5", "\u00a01"])
 def test_other_texts_are_none(text):
-    with pytest.raises(ValueError, match="no number"):
+    with pytest.raises(ValueError, match="not a number"):
         number_of(text)

@@ -206,7 +206,7 @@ def test_bad_dumps_get_a_sentence(tmp_path, ast):
         (lambda t: t[: len(t) // 2], "does not end|not a line of a dump"),
         (lambda t: t.replace("End PolyMap", "End ZoomMap"), "ends a ZoomMap but not the PolyMap"),
         (lambda t: t.replace("CF3 =", "CX3 ="), "CF3 of the PolyMap is missing"),
-        (lambda t: t.replace("NCF1 = 10", "NCF1 = many"), "no number"),
+        (lambda t: t.replace("NCF1 = 10", "NCF1 = many"), "not a number"),
         (lambda t: t.replace("Begin WinMap", "Begin PcdMap").replace("End WinMap", "End PcdMap"),
          "has a PcdMap, which is not a polynomial"),
         (lambda t: t.replace("PF3 = 1", "PF3 = 13"), "order 13"),

@@ -263,7 +263,7 @@ def test_bad_files_get_a_sentence(tmp_path):
         (
             (FAULTS["missing extension"][0], "no extension WCSDVARR,1"),
             (FAULTS["axes exchanged"][0], "not all programs read"),
-            (FAULTS["polynomial"][0], "no look-up table"),
+            (FAULTS["polynomial"][0], "not a look-up table"),
             (lambda h: h["WCSDVARR", 2].header.__setitem__("CDELT1", 20.0), "different grids"),
             (FAULTS["not finite"][0], "not finite"),
         )

@@ -381,7 +381,7 @@ def test_without_asdf_there_is_a_sentence(plain, monkeypatch):
         ({"instrument": "MIRI", "detector": "MIRIFULONG"}, "none of MIRI"),
         (
             {"instrument": "MIRI", "detector": "MIRIMAGE"},
-            "the chip has 2048 x 2048 pixels, and MIRIMAGE 1032 x 1024; name the detector",
+            "the chip has 2048 x 2048 pixels, but MIRIMAGE 1032 x 1024; name the detector",
         ),
     ],
 )

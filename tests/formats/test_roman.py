@@ -145,7 +145,7 @@ def test_a_file_of_the_data_model_is_read(tmp_path):
     ("fault", "level", "where", "message"),
     [
         ("optical element", "warning", "meta.instrument.optical_element", "asks for it"),
-        ("reftype", "error", "meta.reftype", "is 'distortion', and not 'DISTORTION'"),
+        ("reftype", "error", "meta.reftype", "is 'distortion', not 'DISTORTION'"),
     ],
 )
 def test_faults_are_found(changed, fault, level, where, message):

@@ -310,19 +310,19 @@ def test_a_side_file_of_another_table_lends_no_errors(written, tmp_path):
         (
             "AperName,siaf_index,exponent_x,exponent_y,Sci2IdlX,Sci2IdlY,Idl2SciX,Idl2SciY\n"
             "A,10,1,0,0.1,x,1,1\n",
-            "line 2: 'x' is no finite number",
+            "line 2: 'x' is not a finite number",
         ),
         (
             "AperName,siaf_index,exponent_x,exponent_y,Sci2IdlX,Sci2IdlY,Idl2SciX,Idl2SciY\n"
             "A,10,1,0,0.1\n",
-            "has 5 values, and there are 8 columns",
+            "has 5 values, but there are 8 columns",
         ),
         (
             "AperName,siaf_index,exponent_x,exponent_y,Sci2IdlX,Sci2IdlY,Idl2SciX,Idl2SciY\n"
             "A,00,0,0,0,0,0,0\nB,10,1,0,1,1,1,1\n",
             "holds the apertures A, B",
         ),
-        ('{"siaf_covariance": 1, "table"', "is no side file"),
+        ('{"siaf_covariance": 1, "table"', "is not an auxiliary file"),
     ],
 )
 def test_broken_tables_are_refused_in_a_sentence(text, message):

@@ -105,5 +105,5 @@ def test_formats_without_a_limit_hold_them(fit, tmp_path, key):
 )
 def test_formats_with_a_limit_say_it(fit, key, highest, given):
     settings = product_settings()[key].model_construct(**given)
-    with pytest.raises(InputError, match=f"order is 12.* up to order {highest}"):
+    with pytest.raises(InputError, match=f"order is 12.* limited to order {highest}"):
         build(key, calibration_of(fit, "run"), settings, BuildOptions())

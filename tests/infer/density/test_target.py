@@ -191,7 +191,7 @@ def test_the_curvature_of_the_priors_is_added_once():
 
 def test_tables_that_do_not_fit_the_model_are_refused():
     model, matches, _ = simulated(33, 50)
-    with pytest.raises(InputError, match="in pix and the model is in mas"):
+    with pytest.raises(InputError, match="in pix, but the model is in mas"):
         prepare(DistortionModel(2, (CHIP,), unit="mas"), matches)
     bare = type(matches)(matches.x, matches.y, matches.u, matches.v)
     with pytest.raises(InputError, match="have no errors"):

@@ -130,5 +130,5 @@ def test_wrong_input_is_named(turned):
     with pytest.raises(DegenerateError, match="neighbouring pixels to one position"):
         pixel_shifts(Solution(model, flat), matches)
     bare = table(matches.x, matches.y, matches.u, matches.v, unit="arcsec")
-    with pytest.raises(InputError, match="in arcsec and the model is in pix"):
+    with pytest.raises(InputError, match="in arcsec, but the model is in pix"):
         pixel_shifts(Solution(model, theta), bare)

@@ -30,5 +30,5 @@ def test_offsets_come_to_the_unit_of_the_plane(tmp_path, given, unit, factor):
 
 
 def test_pixels_need_their_size(tmp_path):
-    with pytest.raises(InputError, match=r"offsets are in pix, and u and v in arcsec"):
+    with pytest.raises(InputError, match=r"offsets are in pix, but u and v are in arcsec"):
         commanded(tmp_path, "pix", "arcsec", None)

@@ -202,7 +202,7 @@ def test_parallaxes(tmp_path):
 
 def test_parallaxes_need_a_place_on_the_sky(tmp_path):
     config = write_selfcal(tmp_path / "input", list_table(small()), selfcal={"motion": "parallax"})
-    refused(tmp_path, "check", config, words=("selfcal.motion", "where on the sky"))
+    refused(tmp_path, "check", config, words=("selfcal.motion", "position of the field on the sky"))
 
 
 def _on_the_sky(places: np.ndarray) -> Table:
