@@ -39,7 +39,7 @@ class AstObject:
         try:
             return number_of(str(text).strip('"'))
         except ValueError:
-            problem = "is missing" if text is None else f"is {text}, no number"
+            problem = "is missing" if text is None else f"is {text}, not a number"
             raise FormatError(f"{name} of the {self.kind} {problem}", do="write it again") from None
 
 
