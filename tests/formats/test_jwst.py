@@ -85,7 +85,7 @@ def test_other_units_are_written_in_arcsec(unit):
     )
     assert_allclose(theirs.solution.cov / PIXEL**2, calibration.solution.cov / pixel**2, rtol=1e-9)
     if unit == "pix":
-        with pytest.raises(InputError, match="u and v are in pixels, and the file is in arcsec"):
+        with pytest.raises(InputError, match="u and v are in pixels, but the file is in arcsec"):
             files("jwst", calibration, SETTINGS)
 
 

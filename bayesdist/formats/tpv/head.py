@@ -210,7 +210,7 @@ def _head(header: fits.Header, place: int, where: str) -> TpvHead:
 def _number(header: fits.Header, keyword: str, where: str) -> float:
     value = header.get(keyword)
     if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
-        problem = "is missing" if value is None else f"value {value!r} is no finite number"
+        problem = "is missing" if value is None else f"value {value!r} is not a finite number"
         raise FormatError(problem, where=f"{where}, keyword {keyword}", do="correct the header")
     return float(value)
 
