@@ -133,7 +133,7 @@ GOOD = "CRPIX1  = 5.0\nCRPIX2  = 6.0\nA_ORDER = 2\nB_ORDER = 2\nA_2_0   = 1E-5\n
         (GOOD.replace("A_ORDER", "A_ORDR "), "no A_ORDER"),
         (GOOD.replace("B_ORDER", "B_ORDR "), "B_ORDER: is missing"),
         (GOOD.replace("CRPIX2", "CRPIX3"), "CRPIX2: is missing"),
-        (GOOD.replace("1E-5", "'1E-5'"), "keyword A_2_0: value '1E-5' is no finite number"),
+        (GOOD.replace("1E-5", "'1E-5'"), "keyword A_2_0: value '1E-5' is not a finite number"),
         (GOOD.replace("A_ORDER = 2", "A_ORDER = 2.5"), "A_ORDER: polynomial order is 2.5"),
         (GOOD + "AP_ORDER= 3\n", "BP_ORDER: is missing"),
         ("name,value\nA_ORDER,3\n", "no A_ORDER"),
