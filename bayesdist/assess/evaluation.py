@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -282,8 +283,9 @@ def with_measured_centroids(
     errors: ErrorModel, diagnostics: Diagnostics, settings: EvaluationSettings
 ) -> ErrorModel:
     """Error model with the errors of centroids by magnitude, from the scatter of the residuals."""
-    consistent = _contradiction(diagnostics, settings) is None
-    centroids = centroids_of(diagnostics, settings.contained) if consistent else None
+    centroids = None
+    with suppress(InputError):  # see `request_checks`
+        centroids = centroids_of(diagnostics, settings.contained)
     return errors.with_terms(Centroids(centroids))
 
 
