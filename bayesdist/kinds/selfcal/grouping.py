@@ -241,7 +241,9 @@ def cells(places: Float, exposure: Int, length: float, detections: int) -> Itera
     square = _squares(places, length)
     extent = square.max(axis=1) + 1.0
     side = int(np.sqrt(detections / len(places) * extent[0] * extent[1])) + 1
-    side, margin = max(side, MIN_SIDE * FINE), MARGIN * FINE
+    # few detections may be so far apart that a cell would be larger than any square has a number
+    side = min(max(side, MIN_SIDE * FINE), int(np.iinfo(square.dtype).max))
+    margin = MARGIN * FINE
     n_lines = int(square[1].max()) // side + 3  # the first and the last line are empty
     cell = (square[0] // side + np.int64(1)) * n_lines + square[1] // side + 1
     order = np.argsort(cell, kind="stable")

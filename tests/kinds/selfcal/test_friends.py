@@ -10,6 +10,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial.distance import cdist
 
 from bayesdist.data.detections import NO_STAR
+from bayesdist.errors import InputError
 from bayesdist.kinds.selfcal.grouping import (
     FINE,
     MIN_SIDE,
@@ -44,6 +45,17 @@ def test_one_detection_of_an_exposure():
     found = friends_of_friends(places, np.array([0, 1, 2, 2, 0]), 1.0)
     assert found.star.tolist() == [0, 0, 0, NO_STAR, 1]
     assert (found.n_stars, found.n_doubled, found.n_dropped) == (2, 1, 1)
+
+
+@pytest.mark.parametrize("along", [[1, 0], [0, 1], [1, 1]], ids=str)
+@pytest.mark.parametrize("distance", [2**20, 2**26, 2**31 // FINE - 1])
+def test_stars_as_far_apart_as_can_be_numbered(along, distance):
+    """A cell with the usual number of detections is then larger than the grid of squares."""
+    star = np.array([[0.0, 0.0], [0.1, 0.1], distance * np.array(along)])
+    found = friends_of_friends(np.tile(star, (2, 1)), np.repeat([0, 1], 3), 1.0, per_cell=10**6)
+    assert found.star.tolist() == [0, NO_STAR, 1, 0, NO_STAR, 1]
+    with pytest.raises(InputError, match="too far from the others"):
+        friends_of_friends(star * 4 * 2**31 / distance, np.zeros(3, int), 1.0)
 
 
 def test_rounding_does_not_choose_among_two():
