@@ -15,6 +15,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 from types import SimpleNamespace
 
+import astropy.units as apu
 import numpy as np
 import pytest
 import xarray as xr
@@ -794,6 +795,47 @@ def test_init_writes_what_check_accepts(tmp_path, finished, suffix, errors):
     assert not config.states_catalogue and config.user_terms() == ()
     filled = text.replace("sigma_u = 0.0 ", "sigma_u = 0.01 ")
     assert parse_config(filled, "c.toml").states_catalogue
+
+
+@pytest.mark.parametrize(
+    ("epoch", "dated", "name"),
+    [
+        (2016.0, True, "Gaia DR3"),
+        (2015.5, True, "Gaia DR2"),
+        (2000.0, True, ""),
+        (2016.0, False, ""),
+    ],
+)
+def test_init_names_the_release_of_gaia_if_motions_can_be_applied(tmp_path, epoch, dated, name):
+    table = gaia_stars(200, epoch)
+    if not dated:
+        table.remove_column("epoch")
+    table.write(tmp_path / "stars.ecsv")
+    good("init", tmp_path / "c.toml", "--matches", tmp_path / "stars.ecsv")
+    out = good("check", tmp_path / "c.toml").out
+    config = load_config(tmp_path / "c.toml")[0]
+    assert (config.catalogue.name if config.catalogue else "") == name
+    assert [row.name for row in config.budget] == ([] if name else ["reference catalogue"])
+    assert config.states_catalogue == bool(name)
+    assert ("No error of the reference catalogue is stated" in out) == (not name)
+
+
+def gaia_stars(n, ref_epoch, seed=3):
+    """Pixels of 50 mas in 2012, beside columns of Gaia at the epoch of its positions."""
+    rng = np.random.default_rng(seed)
+    x, y = rng.uniform(1, 1000, (2, n))
+    pm = rng.normal(0, 5, (2, n))
+    moved = (ref_epoch - 2012.0) * pm / 3.6e6
+    u, v = np.stack([500.5 - x, y - 500.5]) * 50 / 3.6e6 + rng.normal(0, 0.5, (2, n)) / 3.6e6
+    table = Table({"x": x, "y": y, "phot_g_mean_mag": rng.uniform(14, 19, n)})
+    table["ra"], table["dec"] = (150.0 + u + moved[0]) * apu.deg, (v + moved[1]) * apu.deg
+    table["pmra"], table["pmdec"] = pm * apu.mas / apu.yr
+    for name in ("ra_error", "dec_error"):
+        table[name] = np.full(n, 0.1) * apu.mas
+    for name in ("pmra_error", "pmdec_error"):
+        table[name] = np.full(n, 0.1) * apu.mas / apu.yr
+    table["ref_epoch"], table["epoch"] = np.full(n, ref_epoch), np.full(n, 2012.0)
+    return table
 
 
 def test_inspect(finished, posterior):

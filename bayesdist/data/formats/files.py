@@ -189,6 +189,8 @@ class TableLayout:
     like_chips: dict[str, int]  # number of distinct values in unused columns that may hold chips
     dated: bool  # True if the header has the date of the exposure
     spans: dict[str, tuple[float, float]]  # smallest and largest value of unused numeric columns
+    # smallest and largest epoch of the reference positions; None without a column of numbers
+    catalogue_epochs: tuple[float, float] | None = None
 
     @property
     def lacking(self) -> list[str]:
@@ -232,6 +234,7 @@ def table_layout(
         {name: n for name, column in unused.items() if (n := _values_like_chips(column))},
         own_epoch(header) is not None,
         {name: span for name, column in unused.items() if (span := _span(column)) is not None},
+        _span(table[taken["catalogue_epoch"]]) if "catalogue_epoch" in taken else None,
     )
 
 

@@ -75,16 +75,7 @@ target_rhat = 1.01
 grid = [33, {grid_y}]                 # points on x and y
 # epoch = 2006.5
 
-# Errors that the data cannot show: random | systematic.  As long as both sizes here are 0 and no
-# source is given, the catalogue's error counts as not stated, and no requirement is called met.
-[[budget]]
-name = "reference catalogue"
-kind = "systematic"
-sigma_u = 0.0                   # FILL IN: error of the catalogue's positions over the whole field
-sigma_v = 0.0                   # FILL IN
-unit = "{unit}"
-# source = "published: ..."     # where the sizes are from; needed where they really are 0
-
+{catalogue}
 # [[requirement]]
 # name = "field-wide"
 # statistic = "p95"             # max rms mean p50 p68 p90 p95 p99, or u_... v_... for one axis
@@ -96,6 +87,29 @@ unit = "{unit}"
 sip = {{}}                        # inverse_order, linear = "cd" | "sip", crval
 # parameters = {{}}             # table of all parameters with their covariance
 """
+
+_UNSTATED = """\
+# Errors that the data cannot show: random | systematic.  As long as both sizes here are 0 and no
+# source is given, the catalogue's error counts as not stated, and no requirement is called met.
+[[budget]]
+name = "reference catalogue"
+kind = "systematic"
+sigma_u = 0.0                   # FILL IN: error of the catalogue's positions over the whole field
+sigma_v = 0.0                   # FILL IN
+unit = "{unit}"
+# source = "published: ..."     # where the sizes are from; needed where they really are 0
+"""
+
+_STATED = """\
+# Published systematic errors of the catalogue, which the columns and {column} = {epoch:g} indicate.
+# Correct the name if it is another catalogue.
+[catalogue]
+name = {name}
+"""
+
+# releases of Gaia by the epoch of their positions, and columns by which they are recognised
+_GAIA = {2016.0: "Gaia DR3", 2015.5: "Gaia DR2"}
+_COLUMNS_OF_GAIA = {"phot_g_mean_mag", "ra_dec_corr", "astrometric_params_solved", "ruwe"}
 
 _REJECT = """\
 not_finite = "reject"           # some values are NaN or infinite: such rows are left out
@@ -156,7 +170,12 @@ def init(
     else:
         n, values = _of_matches(matches, columns, size) if mission is None else mission
         order = 4 if n >= 300 else 3 if n >= 100 else 2
-        text = _TEMPLATE.format(matches=relative, order=order, **{"not_finite": ""} | values)
+        unstated = _UNSTATED.format(unit=values["unit"])
+        text = _TEMPLATE.format(
+            matches=relative,
+            order=order,
+            **{"not_finite": "", "catalogue": unstated} | values,
+        )
         parse_config(text, str(path))
         outcome = f"for {n} matches; read it, then 'bayesdist check' it"
     with atomic_path(path) as temporary:
@@ -187,6 +206,7 @@ def _of_matches(
         size,
         Path(matches).stem,
     )
+    stated = {} if layout is None else _gaia(layout)
     nx, ny = next(iter(sizes.values()))
     centre = _CENTRE.format(cx=(nx + 1) / 2, cy=(ny + 1) / 2)
     return len(table), {
@@ -202,7 +222,20 @@ def _of_matches(
         "frames": "shift_rotation_scale" if len(table.exposure_names) > 1 else "none",
         "grid_y": max(3, round(32 * ny / nx) + 1),
         "unit": table.unit,
-    }
+    } | stated
+
+
+def _gaia(layout: TableLayout) -> dict[str, object]:
+    """Value 'catalogue' of the template for stars of a release of Gaia at known dates, or empty."""
+    epochs, taken = layout.catalogue_epochs, layout.taken
+    dated = "pm_ra" in taken and ("epoch" in taken or layout.dated)
+    if epochs is None or epochs[0] != epochs[1] or not dated:
+        return {}
+    name = _GAIA.get(epochs[0])
+    if name is None or not _COLUMNS_OF_GAIA & {column.lower() for column in layout.names}:
+        return {}
+    column = taken["catalogue_epoch"]
+    return {"catalogue": _STATED.format(name=quoted(name), column=column, epoch=epochs[0])}
 
 
 def _read(
@@ -234,7 +267,7 @@ def _read(
     if sigma == "columns" and "sigma_ra" in columns_used and table.has_mag:
         errors = f"{columns_used['sigma_ra']}, {columns_used['sigma_dec']}"
         why = f"the errors of the table ({errors}) are the catalogue's alone"
-        return table, line, f'"by_magnitude"        # {why}', True
+        return table, line, f'"by_magnitude"        # {why}', False
     if sigma == "columns":
         return table, line, '"columns"', True
     if table.has_mag:
