@@ -25,7 +25,7 @@ from bayesdist.utils.arrays import Bool, Float
 RA, DEC = 5.645833333333333, -72.06666666666666
 PIXEL = 0.05 / 3600.0  # degrees
 
-SPANS = ((2002.3, 2007.1), (SM4 + 0.02, 2014.6))  # decimal years in which ACS worked
+SPANS = ((2002.3, 2007.1), (SM4 + 0.02, 2014.6))  # decimal years in which ACS operated
 DITHER = 1500.0  # largest dither along each axis, pixels: the detector stays inside the catalogue
 MIDDLE = (0.0, 1040.0)  # centre of the two chips relative to the reference pixel of WFC2, pixels
 OFF_NOMINAL = 20.0  # largest deviation of the roll angle from the nominal one, degrees
