@@ -381,7 +381,7 @@ def _refuse_other_posterior(posterior: Posterior, matches: Matches, fit: LinearF
         raise InputError(
             "the fit and the posterior have different models",
             where="diagnose",
-            do="give the fit that was given to bd.sample, or leave fit out",
+            do="give the fit that was given to bd.sample, or leave out fit",
         )
 
 

@@ -58,7 +58,7 @@ _MAX_SIDE_RATIO = 0.985  # ratio of two sides; more similar sides may change the
 _MAX_ANCHORS = 500  # largest number of stars of the list around which triangles are made
 _NEIGHBOURS = (5, 6)  # neighbours of each star, in the list and in the reference
 _MAX_CANDIDATES = 3  # number of peaks of the votes that are examined
-_MAX_VOTES = 400_000  # largest number of votes, which limits the memory
+_MAX_VOTES = 400_000  # largest number of votes
 
 
 @dataclass(frozen=True, eq=False)

@@ -159,9 +159,9 @@ class ReadOptions:
         factor = length_in_mm(self.unit)
         if factor is None:
             raise InputError(
-                f"sigma is {self.sigma}, and u and v are in a length that only the file states",
+                f"sigma is {self.sigma}, but u and v are in a length that only the file states",
                 where="data.sigma",
-                do="set the unit, as in unit = 'mm', in which sigma then is",
+                do="set the unit of u, v and sigma, as in unit = 'mm'",
             )
         return self.sigma * factor * self.plate_scale
 
