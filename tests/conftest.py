@@ -97,7 +97,7 @@ FIRST = (
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """The order of FIRST, then that of the folders; tests that need plugins are skipped without."""
     if os.environ.get(SELECTION) == "":
-        hidden = pytest.mark.skip(reason=f"{SELECTION} hides formats and missions")
+        hidden = pytest.mark.skip(reason=f"{SELECTION} hides kinds, formats and missions")
         for item in items:
             if item.get_closest_marker("plugins"):
                 item.add_marker(hidden)

@@ -415,6 +415,7 @@ def agreement(found, published):
     return sum(ours), len(ours) - sum(ours)
 
 
+@pytest.mark.plugins
 def test_real_exposures_match_as_published(data_dir):
     lists, log, master, published = real_lists(data_dir)
     # the published pairs were found by corrected positions and a radius of 2 pixels
@@ -443,6 +444,7 @@ def corrected_positions(data_dir, one: Detections):
     return columns["u"], columns["v"]
 
 
+@pytest.mark.plugins
 def test_real_raw_pixels_need_no_distortion_at_all(data_dir):
     # UVIS bends a field of 1024 pixels by some 30: the cubic takes it up
     lists, log, master, published = real_lists(data_dir)

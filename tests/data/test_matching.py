@@ -149,6 +149,7 @@ def test_the_four_exposures_match_their_master(data_dir):
     assert abs(found - 6815) <= 5
 
 
+@pytest.mark.plugins
 def test_read_matches_does_the_same_in_one_call(data_dir):
     folder = data_dir / "hst1pass_uvis"
     t = read_matches([folder / "*.uvwXYMpq", folder / "MATCHUP_XYMEEE_final"], sigma="by_magnitude")

@@ -321,6 +321,7 @@ def test_tables_on_disk_give_the_matches_of_tables_in_memory(how, tmp_path):
     assert sigma[gone] == pytest.approx(YEARS * 0.040, rel=0.01)
 
 
+@pytest.mark.plugins
 def test_a_prior_without_errors_that_grow_is_refused():
     t, _ = field(60)
     with pytest.raises(InputError, match=r"motion_prior is given, and sigma is 0\.01"):

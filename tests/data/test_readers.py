@@ -307,6 +307,7 @@ def test_each_option_changes_what_is_read_or_is_refused(reader, option, tmp_path
     )
 
 
+@pytest.mark.plugins
 @pytest.mark.parametrize("option", OPTIONS)
 def test_lists_and_saved_matches_refuse_options_that_they_fix(option, tmp_path, data_dir):
     star_table(("x", "y", "u", "v")).write(tmp_path / "a.fits")

@@ -59,6 +59,7 @@ def test_one_table_of_several_exposures(tmp_path):
     assert a.mag.tolist() == [-8.0] and a.q.tolist() == [0.2] and b.chips == (1, 2)
 
 
+@pytest.mark.plugins
 def test_one_file_for_each_exposure(tmp_path):
     for name in ("j2", "j1"):
         Table({"x": [1.0], "y": [2.0]}).write(tmp_path / f"{name}.csv")
@@ -105,6 +106,7 @@ def test_fluxes_that_make_no_magnitudes_are_named(tmp_path, caplog, flux, why):
         assert any(all(one in line for one in words) for line in lines)
 
 
+@pytest.mark.plugins
 @pytest.mark.parametrize(
     ("names", "factor"),
     [(("XWIN_IMAGE", "YWIN_IMAGE", "ERRX2WIN_IMAGE", "ERRY2WIN_IMAGE"), 1.0),
@@ -171,6 +173,7 @@ def test_text_of_other_programs_is_a_star_list(tmp_path):
         assert one.mag.tolist() == [{"j1": -9.5, "j2": 14.5}[one.name]]
 
 
+@pytest.mark.plugins
 def test_real_lists_give_their_raw_pixels(data_dir):
     lists = read_star_lists(data_dir / "hst1pass_uvis" / "*.uvwXYMpq")
     assert [s.name for s in lists] == [f"ie8j01x{c}q_flt" for c in "lmno"]
