@@ -212,7 +212,7 @@ GAIA = ("ra", "dec", "parallax", "pmra", "pmdec")
 # a x + b y + w, c x + d y + z from x - 2048, y - 2048 to pixels to the west and north, a to z in
 # this order, and its covariance.  The prior on the map is flat, Gaia's covariances and the errors
 # of centroids are as given (bp3m enlarges both), and the sign of the parallax factors is reversed:
-# that version displaces stars towards the Earth.
+# that version displaces stars in the direction of the Earth.
 BP3M = [0.8389215178, 0.544795887, -0.5447954417, 0.8390239653, 2.972841774, -5.010299809]
 BP3M_COVARIANCE = [
     [1.082853e-10, -3.866658e-11, 3.746602e-11, -3.023564e-11, -2.687794e-09, -8.152239e-09],
