@@ -18,7 +18,11 @@ from bayesdist.data import Matches
 from bayesdist.errors import DegenerateError
 from bayesdist.files.tables import read_table
 from bayesdist.infer import fit_linear, load_fit
-from bayesdist.kinds.campaign.input_validation import frames_not_set, shear_warnings
+from bayesdist.kinds.campaign.input_validation import (
+    distance_of_pointings,
+    frames_not_set,
+    shear_warnings,
+)
 from bayesdist.model import Chip, DistortionModel
 from tests.app.damaged import CONFIG, ONE, Campaign, masked, scattered, setting
 from tests.app.support import cli, good, one_sentence, refused, summary_of
@@ -652,3 +656,10 @@ def test_names_in_other_scripts_are_no_fault(campaign):
     campaign.replaced('name = "WFC2"', 'name = "Détecteur 检测器"')
     campaign.replaced("[products.release]", "[products.tpv]\n[products.cpdis]\n[products.release]")
     good("check", campaign.path / CONFIG)
+
+
+def test_the_distance_of_pointings_is_an_angle_on_the_sky():
+    """Two pointings at a declination of 60 degrees, one of them across the zero of RA."""
+    ra, dec = np.array([359.0, 1.0, np.nan]), np.array([60.0, 60.0, 60.0])
+    assert distance_of_pointings(ra, dec) == pytest.approx(0.5, rel=1e-3)
+    assert distance_of_pointings(ra[2:], dec[2:]) == 0.0

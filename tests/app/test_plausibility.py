@@ -54,6 +54,18 @@ def doubts(found, **settings):
     return doubts_on_stars(found, model(found.unit), config(**settings))
 
 
+@pytest.mark.parametrize(("apart", "named"), [(0.0, False), (0.1, True)])
+def test_pointings_that_share_few_errors_of_the_catalogue_are_named(rng, apart, named):
+    """Errors of 2MASS are correlated over 0.15 degrees; pointings are 2 `apart` from each other."""
+    exposure = np.repeat([0, 1], 100)
+    seen = stars(rng, 0.05, "arcsec", exposure=exposure, exposure_names=("a", "b"))
+    shift = 2 * apart * 3600 * 2 * (exposure - 0.5)
+    seen = replace(seen, u=seen.u + shift, v=seen.v)
+    for more in ('[catalogue]\nname = "2MASS"', ""):
+        text = " ".join(doubts(seen, more=more))
+        assert ("exposures are up to 0.2 degrees from their mean" in text) == (named and bool(more))
+
+
 def dots(rng, order, noise=0.02, false=0.0, n=1200):
     """Positions that follow Legendre terms of one order, 3 px large, and false matches."""
     x, y = rng.uniform(1, 1000, n), rng.uniform(1, 800, n)

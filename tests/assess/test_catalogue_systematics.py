@@ -296,6 +296,8 @@ def test_every_published_catalogue_makes_positive_covariances(pixels):
         parts = [part for part in fields.parts if part.startswith(name)]
         assert np.all(np.concatenate([fields.sigma(part) for part in parts[:1]]) > 0), name
         assert systematics.source.startswith("published: ")
+        # no release of Gaia publishes a covariance of its positions
+        assert ("assumption" in systematics.of_positions) == name.startswith("Gaia")
 
 
 @pytest.mark.parametrize(

@@ -42,11 +42,27 @@ BEST_ORDER = 1.2  # ratio of scatters below which two orders are equally good
 MOST_STARS = 1500  # used to compare orders
 YEARS = (1950.0, 2100.0)
 
+DEGREES = {"deg": 1.0, "arcsec": 1.0 / 3600.0, "mas": 1.0 / 3.6e6}  # of a unit of u and v
+
 
 def doubts_on_stars(stars: Matches, model: DistortionModel, config: Config) -> list[str]:
     """Sentences about unusual properties of matched stars (all or a sample, in memory)."""
     doubts = list(_doubts(stars, model, config.detector.scale_mas))
+    if config.catalogue is not None and model.unit in DEGREES:
+        apart = DEGREES[model.unit] * _distance_of_exposures(stars)
+        doubt = config.catalogue.catalogue().doubt_on_pointings(apart)
+        doubts += [doubt] if doubt else []
     return [*doubts, *_doubts_on_order(stars, model.order)]
+
+
+def _distance_of_exposures(stars: Matches) -> float:
+    """Largest distance of the mean position of an exposure's stars from that of all, in u and v."""
+    if stars.exposure is None:
+        return 0.0
+    n = np.maximum(np.bincount(stars.exposure), 1)
+    middle = np.stack([np.bincount(stars.exposure, a) / n for a in (stars.u, stars.v)])
+    middle = middle[:, np.bincount(stars.exposure) > 0]
+    return float(np.hypot(*(middle - middle.mean(axis=1, keepdims=True))).max())
 
 
 def refuse_stars(stars: Matches, model: DistortionModel, config: Config) -> None:
@@ -76,9 +92,15 @@ def _scale(stars: Matches) -> float | None:
 
 
 def _spread(stars: Matches, values: Float) -> float:
-    """Standard deviation about the mean of each chip, since chips are side by side in u and v."""
-    n = np.maximum(np.bincount(stars.chip), 1)
-    return float(np.std(values - (np.bincount(stars.chip, values) / n)[stars.chip]))
+    """Standard deviation about the mean of each chip in each exposure.
+
+    Chips are side by side in u and v, and so are exposures with different pointings.
+    """
+    code = stars.chip
+    if stars.exposure is not None:
+        code = code + (int(code.max()) + 1) * stars.exposure
+    n = np.maximum(np.bincount(code), 1)
+    return float(np.std(values - (np.bincount(code, values) / n)[code]))
 
 
 def _doubts_on_scale(

@@ -44,12 +44,13 @@ NO_ERRORS = AngularCovariance()
 class Systematics:
     """Published systematic errors of a catalogue; docs/method.md lists the sources."""
 
-    source: str
+    source: str  # of the motions, or of the positions if `of_positions` is empty
     positions: AngularCovariance  # at `epoch`
     motions: AngularCovariance = NO_ERRORS
     # common error of the motions of stars brighter than BRIGHT: rotation of their frame
     bright_motions: AngularCovariance = NO_ERRORS
     epoch: float | None = None  # of the positions, decimal years; None if motions have no errors
+    of_positions: str = ""  # source of the positions if they have another one
 
 
 def _gaia(motions: AngularCovariance, parallaxes: AngularCovariance) -> AngularCovariance:
@@ -60,6 +61,11 @@ def _gaia(motions: AngularCovariance, parallaxes: AngularCovariance) -> AngularC
     """
     return motions + parallaxes.times(0.5)
 
+
+_ASSUMED = (
+    f"{PUBLISHED} errors of motions and parallaxes, and the assumption that positions err as "
+    "motions do in one year"
+)
 
 # mas^2 and degrees
 _MOTIONS_3 = AngularCovariance(((292e-6, 12.0), (333e-6, 0.25)))
@@ -72,22 +78,23 @@ _SPIN_2 = AngularCovariance(((0.150**2 / 3.0, EVERYWHERE),))
 
 _GAIA_3 = Systematics(
     f"{PUBLISHED}: Lindegren et al. 2021 (A&A 649, A2), Vasiliev & Baumgardt 2021, Cantat-Gaudin & "
-    "Brandt 2021; positions as motions of one year",
+    "Brandt 2021",
     _gaia(_MOTIONS_3, _PARALLAXES_3),
     _MOTIONS_3,
     _SPIN_3,
     2016.0,
+    f"{_ASSUMED} (Lindegren et al. 2021, A&A 649, A2)",
 )
 PUBLISHED_SYSTEMATICS: Mapping[str, Systematics] = {
     "Gaia DR3": _GAIA_3,
     "Gaia EDR3": _GAIA_3,
     "Gaia DR2": Systematics(
-        f"{PUBLISHED}: Lindegren et al. 2018 (A&A 616, A2), Vasiliev 2019; positions as motions of "
-        "one year",
+        f"{PUBLISHED}: Lindegren et al. 2018 (A&A 616, A2), Vasiliev 2019",
         _gaia(_MOTIONS_2, _PARALLAXES_2),
         _MOTIONS_2,
         _SPIN_2,
         2015.5,
+        f"{_ASSUMED} (Lindegren et al. 2018, A&A 616, A2)",
     ),
     "Pan-STARRS": Systematics(
         f"{PUBLISHED}: Magnier et al. 2020 (ApJS 251, 6), Lubow et al. 2021",
@@ -298,7 +305,31 @@ class Catalogue:
         motions = systematics.motions + systematics.bright_motions.times(bright_fraction**2)
         years = float(np.mean(dates)) if len(dates) else None
         return CatalogueSystematics(
-            self.row_name, systematics.positions, motions, systematics.epoch, source, years
+            self.row_name,
+            systematics.positions,
+            motions,
+            systematics.epoch,
+            source,
+            years,
+            systematics.of_positions,
+        )
+
+    def doubt_on_pointings(self, apart: float) -> str:
+        """Warning if exposures point farther apart than errors are correlated; else empty.
+
+        `apart` is the largest distance of a pointing from the mean of all, in degrees.
+        """
+        if self.sigma is not None:
+            return ""
+        systematics, _ = self._systematics()
+        parts = (*systematics.positions.parts, *systematics.motions.parts)
+        shortest = min((s for _, s in parts if math.isfinite(s)), default=math.inf)
+        if not apart > shortest:
+            return ""
+        return (
+            "[catalogue] states the errors of one pointing, and exposures are up to "
+            f"{apart:.2g} degrees from their mean: errors that are correlated over "
+            f"{shortest:.2g} degrees are smaller in the mean of the exposures than is stated"
         )
 
     def _systematics(self) -> tuple[Systematics, str]:
@@ -410,18 +441,19 @@ class CatalogueSystematics:
     epoch: float | None  # of the positions in the catalogue, decimal years
     source: str
     date: float | None = None  # mean date of the exposures, decimal years
+    of_positions: str = ""  # source of the positions if it is not `source`
 
     @property
     def rows(self) -> tuple[Row, ...]:
         """Rows of the budget: constant and tilt, and the rest; of positions and of motions."""
-        names = [self.name] if self.positions.parts else []
-        names += [f"{self.name} {MOTIONS_OF}"] if self.motions.parts else []
+        names = [(self.name, self.of_positions or self.source)] if self.positions.parts else []
+        names += [(f"{self.name} {MOTIONS_OF}", self.source)] if self.motions.parts else []
         return tuple(
             row
-            for name in names
+            for name, source in names
             for row in (
-                Row(name, source=self.source),
-                Row(f"{name} ({OVER_THE_FIELD})", LOCAL, self.source),
+                Row(name, source=source),
+                Row(f"{name} ({OVER_THE_FIELD})", LOCAL, source),
             )
         )
 

@@ -95,12 +95,27 @@ def input_warnings(inputs: Inputs) -> list[str]:
                 f"{name} asks for {epoch:g}, and the exposures are from {epochs.min():.2f} to "
                 f"{epochs.max():.2f}: the drift is extrapolated by more than they span"
             )
+    if config.catalogue is not None:
+        apart = distance_of_pointings(log.values("ra"), log.values("dec"))
+        doubt = config.catalogue.catalogue().doubt_on_pointings(apart)
+        out += [doubt] if doubt else []
     if config.campaign.vafactor_source == "earth":
         out.append(
             "the factors of velocity aberration were computed from the motion of the Earth: that "
             "of the telescope about it, up to 2.5e-5, is in the scales of the exposures"
         )
     return out
+
+
+def distance_of_pointings(ra: Float, dec: Float) -> float:
+    """Largest distance of a pointing from the mean of all, in degrees; 0 if they are unknown."""
+    known = np.isfinite(ra) & np.isfinite(dec)
+    if not known.any():
+        return 0.0
+    a, d = np.radians(ra[known]), np.radians(dec[known])
+    xyz = np.stack([np.cos(d) * np.cos(a), np.cos(d) * np.sin(a), np.sin(d)], axis=1)
+    chord = float(np.linalg.norm(xyz - xyz.mean(axis=0), axis=1).max())
+    return float(np.degrees(2.0 * np.arcsin(min(chord / 2.0, 1.0))))
 
 
 def _unlogged(names: tuple[str, ...], log: str) -> str:

@@ -101,7 +101,7 @@ unit = "{unit}"
 """
 
 _STATED = """\
-# Published systematic errors of the catalogue, which the columns and {column} = {epoch:g} indicate.
+# Systematic errors of the catalogue, which the columns and {column} = {epoch:g} indicate.
 # Correct the name if it is another catalogue.
 [catalogue]
 name = {name}
