@@ -207,7 +207,7 @@ def command(
         is_flag=True,
         expose_value=False,
         callback=lambda ctx, param, quiet: start_logging(quiet=quiet),
-        help="Print only warnings and errors.",
+        help="Print results, warnings and errors only, no messages on progress.",
     )
 
     def decorated(function: Callable[..., int | None]) -> click.Command:
