@@ -231,6 +231,22 @@ def test_catalogues_have_the_motions_and_errors_of_tables_of_matches():
     assert len(few) == 10 and few.assumed_motion is None
 
 
+@pytest.mark.parametrize(
+    ("name", "value"), [("pmra", np.inf), ("pmra_error", np.nan), ("pmdec_error", np.inf)]
+)
+def test_a_motion_that_is_infinite_or_without_an_error_is_not_a_missing_one(name, value):
+    t = masked(field(900)[0], third(900))
+    t[name][1] = value
+    c = catalog_from_table(t, tangent_point=POINT)
+    assert len(c) == 899 and c.assumed_motion.sum() == 300
+    assert any("1 stars are left out" in note for note in c.notes), c.notes
+    m = read(t, epoch=EPOCH, not_finite="reject")
+    assert len(m) == 899 and sum(m.rejected.values()) == 1
+    if name != "pmra":  # rows without a motion that can be used are left out in any case
+        with pytest.raises(InputError, match=rf"row 2, column '{name}'"):
+            read(t, epoch=EPOCH)
+
+
 @pytest.mark.parametrize("unit", ["mas", "pix"])
 def test_catalogues_on_a_plane_have_them_in_their_unit(unit):
     rng = np.random.default_rng(3)

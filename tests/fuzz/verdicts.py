@@ -37,6 +37,7 @@ PYTHON = re.compile(
 NO_ROOM = re.compile(r"MemoryError|[Uu]nable to allocate|[Cc]annot allocate|malloc of size")
 WARNING = re.compile(
     r"warn|reject|left out|not here|ignored|skipped|error:|note:|does not|no value|missing|masked"
+    r"|have no motion"
     r"|again, as|incomplete|not as|degenerate|damaged|faults|not converged|GUESSED|LOOK",
     re.IGNORECASE,
 )

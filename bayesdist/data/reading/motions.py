@@ -139,7 +139,9 @@ class MovingStars:
         zero = zero_motions(*(_plain(columns[key].values) for key in MOTIONS[:2]))
         missing = zero | _without_solution(table)
         for key in MOTIONS[:2]:
-            missing |= absent(_plain(columns[key].values), not_finite=True)
+            values = _plain(columns[key].values)
+            # an infinite motion is not a missing one: reading refuses it, or leaves its row out
+            missing |= absent(values, not_finite=True) & ~_infinite(values)
         factors = {}
         for key, per_year in FILLED.items():
             names = (key, f"sigma_{key}")
@@ -244,6 +246,7 @@ class MotionPrior:
             for name, factor, filling in pairs:
                 column = quantities[name]
                 values = column.numbers_or(0.0)
+                values[absent(_plain(column.values), not_finite=True)] = np.nan
                 values[missing] = filling / factor
                 out[column.name] = Column(values, unit=column.unit)
         for key in CORRELATIONS - {"corr_ra_dec"}:
@@ -342,6 +345,12 @@ def warn_of_zeros(names: Sequence[str], n_zero: int, n: int, source: str) -> Non
 def _plain(column: Any) -> Any:
     """Values of a column that is encoded, or the column itself."""
     return column.plain if isinstance(column, EncodedColumn) else column
+
+
+def _infinite(column: Any) -> Bool:
+    """Mask (N,) of infinite values of a column; False for masked ones."""
+    values = np.ma.filled(np.ma.asarray(getattr(column, "value", column)), 0)
+    return np.isinf(values) if values.dtype.kind == "f" else np.zeros(len(values), bool)
 
 
 def unnamed_columns(names: Iterable[str]) -> list[str]:

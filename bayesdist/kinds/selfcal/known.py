@@ -29,6 +29,8 @@ _COLUMNS = {
     "roll": ("roll",),
     "group": ("group", "guide_stars"),
 }
+# largest plausible numbers: offsets and errors in the unit of u and v, rolls in degrees
+_LARGEST = {"du": 1e8, "dv": 1e8, "sigma": 1e8, "roll": 720.0}
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +67,8 @@ def read_commanded(
     Raises
     ------
     InputError
-        If columns, exposures or errors are missing, or an exposure is listed twice.
+        If columns, exposures or errors are missing, an exposure is listed twice, or a number is
+        implausibly large.
     """
     table = read_table(path)
     columns = find_columns(table.colnames, None, _COLUMNS, source=str(path))
@@ -79,10 +82,17 @@ def read_commanded(
     def column(key: str) -> SourceColumn:
         return SourceColumn(table[columns[key]], str(path), columns[key])
 
+    def numbers(key: str, factor: float = 1.0) -> Float:
+        values = column(key).numbers() * factor
+        large = ~(np.abs(values) <= _LARGEST[key])
+        if large.any():
+            raise column(key).fail(int(np.argmax(large)), "is implausibly large")
+        return values
+
     def length(key: str) -> Float:
         column_unit = column(key).unit
-        return column(key).numbers() * (
-            1.0 if column_unit is None else _factor(column_unit, unit, scale_mas, path)
+        return numbers(
+            key, 1.0 if column_unit is None else _factor(column_unit, unit, scale_mas, path)
         )
 
     codes, labels = column("exposure").labels()
@@ -117,7 +127,7 @@ def read_commanded(
     group = np.zeros(len(names), np.int64)
     if "group" in columns:
         group = np.where(rows >= 0, column("group").labels()[0][rows], -1)
-    roll = np.radians(of_each(column("roll").numbers())) if "roll" in columns else None
+    roll = np.radians(of_each(numbers("roll"))) if "roll" in columns else None
     return Commanded(offsets, error, roll, group)
 
 

@@ -32,3 +32,13 @@ def test_offsets_come_to_the_unit_of_the_plane(tmp_path, given, unit, factor):
 def test_pixels_need_their_size(tmp_path):
     with pytest.raises(InputError, match=r"offsets are in pix, but u and v are in arcsec"):
         commanded(tmp_path, "pix", "arcsec", None)
+
+
+@pytest.mark.parametrize(("name", "value"), [("du", 1.9e172), ("sigma", 1e9), ("roll", 1e5)])
+def test_implausibly_large_numbers_are_refused_by_row(tmp_path, name, value):
+    table = Table({"exposure": ["a", "b"], "du": [0.0, 10.0], "dv": [0.0, -5.0]})
+    table["sigma"], table["roll"] = 1.0, 90.0
+    table[name][1] = value
+    table.write(tmp_path / "commanded.csv")
+    with pytest.raises(InputError, match=rf"row 2, column '{name}': is implausibly large"):
+        read_commanded(tmp_path / "commanded.csv", ["a", "b"], "pix", None, None)
