@@ -1,6 +1,7 @@
-"""Positions at which errors are evaluated, on chips or on regions of them.
+"""Positions at which errors are evaluated, and statistics that reduce an error field to one number.
 
-Statistics that reduce an error field to one number.
+Positions are on whole chips or in regions of them, at an epoch and optionally for the magnitude of
+a star.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Maps over the detector: uncertainty of positions, and areas of pixels.
+"""Maps over the detector: uncertainty of positions, circular errors, and relative pixel areas.
 
-Maps of the uncertainty of positions, and circular errors for a given probability.
-
-Area of a pixel in (u, v), relative to that of the reference pixel.
+The uncertainty of a position is the standard deviation of u and v; a circular error is the radius
+that contains the true position with a given probability. Areas of pixels in (u, v) are relative to
+that of the reference pixel.
 """
 
 from __future__ import annotations

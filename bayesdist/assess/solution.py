@@ -1,9 +1,11 @@
-"""A solution on one chip at one epoch in one exposure, where it is a single polynomial.
+"""A solution on one chip at one epoch in one exposure, chip positions, and the coefficient table.
 
-Maps, budgets and margins therefore need only the 2 K coefficients and their covariance, instead of
-one Jacobian row per grid point and parameter. Their cost is independent of the number of exposures.
+On one chip at one epoch in one exposure a solution is a single polynomial. Maps, budgets and
+margins therefore need only the 2 K coefficients (K terms on each axis) and their covariance,
+instead of one Jacobian row per grid point and parameter. Their cost is independent of the number of
+exposures.
 
-Table of the coefficients with formal and posterior errors, in Legendre and monomial form.
+The table of coefficients has formal and posterior errors, in Legendre and monomial form.
 """
 
 from __future__ import annotations

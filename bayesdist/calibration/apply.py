@@ -10,13 +10,13 @@ The forward transformation has four steps:
 
 The inverse solves the forward transformation by Newton's method to rounding error.
 
-Subarrays: conversion between pixels of an image and pixels of the full chip.
+Pixels of a subarray and of the full chip, both FITS 1-based, are related by the header keywords LTM
+and LTV as in stwcs:
 
     image = LTM chip + LTV
 
-in FITS 1-based pixels, as in stwcs.  CENTERA and SIZAXIS are not used.  They include the overscan,
-and calibration pipelines change SIZAXIS but not CENTERA, so that for calibrated images they do not
-give the corner of the image.
+CENTERA and SIZAXIS are not used.  They include the overscan, and calibration pipelines change
+SIZAXIS but not CENTERA, so that for calibrated images they do not give the corner of the image.
 """
 
 from __future__ import annotations

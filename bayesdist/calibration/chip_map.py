@@ -2,10 +2,10 @@
 
 Fits, posteriors and files of all formats are converted to such maps, so that any two of them can be
 compared, applied and inverted.  Look-up tables may correct the pixels before the polynomial, or add
-to the positions after it (evaluated at the corrected pixel).  The covariance does not include the
-errors of look-up tables.
+to the positions after it (evaluated at the corrected pixel).
 
-Position errors outside of the covariance of the parameters, in a form for files.
+The covariance is that of the parameters.  It does not include the errors of look-up tables.
+Further position errors are listed as `FurtherError`, in a form that files can store.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Sky positions of pixels, with their covariance according to a calibration.
+"""Sky positions of pixels, with their covariance according to a calibration or as random draws.
 
 Let phi be the Legendre products at a pixel, S the covariance of the coefficients, and A the
 derivative of the offset on the sky (east, north) with respect to the plane (u, v).  The covariance
@@ -11,7 +11,7 @@ are independent for each star, C that of the centroid in pixels, and J the deriv
 Local errors that are correlated over some pixels also contribute to the covariance of stars on the
 same chip, depending on their separation.
 
-Sky positions as distributions: random draws of all errors of a calibration.
+`sky_distribution` draws positions with all of these errors.
 """
 
 from __future__ import annotations

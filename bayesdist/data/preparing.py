@@ -1,9 +1,11 @@
-"""Preparation for the fit: selection by proper-motion error, centroid errors, and aberration.
+"""Preparation of matches for the fit: selection, centroid errors, aberration, and held-out stars.
 
-Matches that are held out of the fit in order to be predicted afterwards.
+Stars are selected by the errors of their proper motions. Centroid errors are derived from the
+scatter of the residuals, and catalogue positions are converted to a scale without aberration.
 
-The selection depends on a seed and on the star code, or on the detector position if there are no
-codes. It does not depend on the order of the rows or on the batches in which they are read.
+Matches that are held out of the fit are predicted afterwards. Their selection depends on a seed and
+on the star code, or on the detector position if there are no codes. It does not depend on the order
+of the rows or on the batches in which they are read.
 """
 
 from __future__ import annotations

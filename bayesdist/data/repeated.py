@@ -1,18 +1,15 @@
 """Rows that occur repeatedly, and reference stars that occur in several rows.
 
-Reference stars that occur in several rows, recognised by their positions.
+**Reference stars.** Rows of one star share the error of its reference position. Tables often lack a
+column that identifies the star; rows with equal reference positions then belong to one star. Stars
+may also form tight groups, such as the pinholes of a fiducial, with position errors that are common
+to the group.
 
-Rows of one star share the error of its reference position. Tables often lack a column that
-identifies the star; rows with equal reference positions then belong to one star. Stars may also
-form tight groups, such as the pinholes of a fiducial, with position errors that are common to the
-group.
-
-Search for repeated rows in a table that is in memory or streamed.
-
-Each row is hashed to one integer, so that ten million rows need one sort instead of one per key.
-Only rows with equal hashes are compared in full. For a streamed table, hashes are sorted into
-buckets of about `HELD` in a scratch file, which are then processed one by one: the cost grows
-linearly with the number of rows, and the memory does not grow.
+**Repeated rows** are found in a table that is in memory or streamed. Each row is hashed to one
+integer, so that ten million rows need one sort instead of one per key. Only rows with equal hashes
+are compared in full. For a streamed table, hashes are sorted into buckets of about `HELD` in a
+scratch file, which are then processed one by one: the cost grows linearly with the number of rows,
+and the memory does not grow.
 """
 
 from __future__ import annotations

@@ -1,19 +1,20 @@
 """Sky positions: epochs, effects of the Earth's motion, and tangent planes.
 
-Reference positions on the sky, with the errors and motions of a catalogue.
+**Epochs.** Reference positions of a catalogue are moved to the epoch of the exposures: space motion
+by astropy, and the parallax as seen from the Earth. Their errors include those of motion and
+parallax.
 
-Positions are moved to the epoch of the exposures: space motion by astropy, and the parallax as seen
-from the Earth. Their errors include those of motion and parallax.
-
-Effects of the Earth's motion on positions: parallax, and the scale of aberration.
+**Aberration.** Stars are displaced towards the apex of the Earth's motion. A true offset on the sky
+is a factor times the offset computed with an aberration-free pixel scale (Cox & Gilliland 2002, HST
+Calibration Workshop):
 
     factor = sqrt(1 - b^2) / (1 - n . b),    b = velocity / c
 
-Stars are displaced towards the apex of the motion: a true offset on the sky is the factor times the
-offset computed with an aberration-free pixel scale (Cox & Gilliland 2002, HST Calibration
-Workshop). Aberration is conformal, so the factor is the same in all directions.
+with the direction n of the target. Aberration is conformal, so the factor is the same in all
+directions.
 
-Tangent plane: gnomonic projection of the sky, in seconds of arc.
+**Tangent plane.** The gnomonic projection of the position (a, d) about the tangent point (a0, d0),
+converted to seconds of arc, is
 
     D   = sin d sin d0 + cos d cos d0 cos(a - a0)
     xi  = cos d sin(a - a0) / D                                  east

@@ -1,14 +1,8 @@
-"""Matches in Parquet files: writing, scanning, and reading from disk in batches.
+"""Matches in Parquet files: written table by table, and read from disk batch by batch.
 
-Matches that stay on disk: Parquet files, read batch by batch.
-
-A scan with one block in memory at a time collects what must be known about all rows: the names of
-exposures, chips and filters, and the tangent point. It also checks that no row is invalid or
-repeated.
-
-Parquet files of matches: how each file is read, and the labels found by scanning all of them.
-
-Write columns, or matches table by table, to Parquet.
+`open_matches` leaves the rows on disk. A scan with one block in memory at a time collects what must
+be known about all rows: the names of exposures, chips and filters, and the tangent point. It also
+checks that no row is invalid or repeated. A `StoredFile` describes how one file is read.
 """
 
 from __future__ import annotations

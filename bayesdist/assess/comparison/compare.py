@@ -1,10 +1,12 @@
-"""Compare two calibrations: where and by how much they differ, and how significantly.
+"""Comparison of two calibrations: where and by how much they differ, and how significantly.
 
-The chi-square of the whole field does not depend on how shift, rotation and scale are removed. With
+`compare` transforms both calibrations to a common frame and tests the difference that remains. Its
+chi-square over the whole field does not depend on how shift, rotation and scale are removed: with
 the covariance of the remaining difference, every linear method gives the same value, with four
 degrees of freedom fewer.
 
-A comparison in sentences: the verdict, what was removed, and which errors were used.
+The result can be shown as tables, or in sentences that give the verdict, what was removed, and
+which errors were used. Offsets between chips have separate tables and verdicts.
 """
 
 from __future__ import annotations

@@ -1,23 +1,25 @@
-"""Two calibrations in a common frame: the similarity between them, and the remaining difference.
+"""Common frame of two calibrations A and B, and differences between A and B in this frame.
 
-With w = u + i v, as a mean over the area of the detector,
+**Whole detector.** With w = u + i v, and means over the area of the detector,
 
     w_A = shift + turn w_B + d        (or the conjugate of w_B if one of them is mirrored)
 
-is solved for shift and turn by least squares over the whole detector. The residual d is the part
-that no shift, rotation or scale explains. It is given along the axes of the detector in undistorted
-pixels of A, that is, divided by the linear part of A.
+is solved for shift and turn by least squares. The residual d is the part that no shift, rotation or
+scale explains. It is given along the axes of the detector in undistorted pixels of A, that is,
+divided by the linear part of A.
 
-Gap between chips: compare the relative position of two chips in A and in B.
+Several chips are compared one by one, each after removing its best-fitting shift, rotation and
+scale. A shift, rotation or scale of the frame applies to all chips in the same way, so the position
+of one chip relative to another is compared separately.
 
-Chips are compared one by one, each after removing its best-fitting shift, rotation and scale. These
-apply to all chips in the same way. After the similarity of the reference chip has been removed from
-the whole detector, w = u + i v of another chip is
+**Gap between two chips.** The position of a chip relative to a reference chip is compared in A and
+in B. The similarity (shift and turn) of the reference chip is removed from the whole detector. For
+the other chip, then,
 
     w_A = shift + (1 + scale + i rotation) (turn w_B - its mean) + d
 
-with shift, rotation and scale of the chip relative to the reference chip. They are linear in the
-coefficients of both chips, and so are their errors.
+with shift, rotation and scale relative to the reference chip. They are linear in the coefficients
+of both chips, so their errors propagate linearly.
 """
 
 from __future__ import annotations

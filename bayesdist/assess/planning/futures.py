@@ -1,8 +1,9 @@
-"""Preposterior analysis: probability that a requirement would be met with more exposures.
+"""Number and dates of further exposures that would meet a requirement (preposterior analysis).
 
 The outcome of further exposures is unknown, but today's posterior gives its probability. True
 parameters ("truths") are drawn from it. For each of them, the error model of a run with the
-existing and the further exposures is predicted, and the requirement is judged with it:
+existing and the further exposures is predicted, and the requirement is judged with it. The fraction
+of truths with which it is met is the probability that it would be met. The prediction is:
 
 - Coefficients: the information of all exposures is used. In a self-calibration each star uses up
   one of its detections, so further exposures of the same stars add more than the existing ones.
@@ -21,8 +22,6 @@ existing and the further exposures is predicted, and the requirement is judged w
   but its size becomes better known. A limit that is smaller than it is therefore never met, and
   with few exposures this cannot be told.
 - Everything else, such as the stated error of a catalogue, is unchanged.
-
-Number and dates of further exposures that would meet a requirement.
 """
 
 from __future__ import annotations

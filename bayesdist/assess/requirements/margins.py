@@ -1,10 +1,9 @@
-"""Margins by which a solution meets requirements, and how long they hold.
+"""Margins by which a solution meets requirements, and what follows from them for the user.
 
-Requirements on the position error, and the margins by which a solution meets them.
-
-Reduction of an error term that would meet a requirement.
-
-Validity period of a calibration: until when a requirement is met by the extrapolated drift.
+`judge` compares draws of the position error with the limit of each requirement. If a requirement is
+not met, `required_reduction` finds the error term that needs the smallest reduction. For a model
+with a drift, `validity_period` gives the probability of meeting a requirement as a function of the
+epoch, with the drift extrapolated, and so how long the calibration remains valid.
 """
 
 from __future__ import annotations

@@ -1,10 +1,9 @@
 """Verdicts on requirements, the probabilities that they rest on, and their assumptions.
 
-Verdict on a requirement from a probability counted in draws, and its assumptions.
-
-A probability estimated by counting draws, and its effective number of independent draws.
-
-Checks of the assumptions of an evaluation: residuals, catalogue and dates.
+The probability of meeting a limit is the fraction of draws that meet it. Its error depends on the
+effective number of independent draws (`Tally`), since draws may share members of a finite set of
+draws. A verdict is also subject to assumptions about residuals, catalogue and dates: checks test
+these as far as possible, and clauses state them.
 """
 
 from __future__ import annotations

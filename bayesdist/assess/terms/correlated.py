@@ -1,6 +1,8 @@
 """Error terms for correlated errors that remain after a calibration.
 
-Errors that are shared by all stars near a position and vary over the detector.
+Structure that the model omits, deviations of exposures, and curvature of a drift displace many
+stars together, so that they do not average out. Local errors, such as those of a look-up table, are
+shared by all stars near a position and vary over the detector.
 """
 
 from __future__ import annotations

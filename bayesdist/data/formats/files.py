@@ -1,8 +1,7 @@
-"""Files named by a path, their formats, and the exposures that they represent.
+"""Files of matches: paths, formats, exposure names, and the interpretation of their columns.
 
-Interpretation of the columns of a table, which can be shown and saved before it is read.
-
-Matches in an HDF5 file that stores every column and label exactly.
+The interpretation of the columns of a table can be shown and saved before the table is read.
+`write_matches` writes an HDF5 file that stores every column and label of matches exactly.
 """
 
 from __future__ import annotations

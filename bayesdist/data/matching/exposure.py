@@ -1,10 +1,10 @@
 """Match one exposure of a campaign with the catalogue at its epoch.
 
-Search radius for pairs, derived from the distances of the pairs.
-
-In regions with a less well known distortion, usually the corners, pairs need a larger search radius
-than in the middle. A radius that is large everywhere includes false matches (the distortion
-report, Section 3, item 1: criteria that depend on the radial distance from the centre).
+The search radius for pairs depends on the distance from the centre of the detections and is derived
+from the distances of the pairs. In regions with a less well known distortion, usually the corners,
+pairs need a larger radius than in the middle. A radius that is large everywhere includes false
+matches (the distortion report, Section 3, item 1: criteria that depend on the radial distance from
+the centre).
 """
 
 from __future__ import annotations

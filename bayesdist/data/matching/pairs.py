@@ -1,9 +1,8 @@
-"""Pairs between two lists of positions after a transformation.
+"""Pairs between two lists of positions, and the maps between the lists that are fitted to them.
 
-Maps between two lists of positions, fitted to pairs that the maps bring together.
-
-Linear maps are iterated. Distortion that is not known in advance is fitted by a cubic per chip,
-which is used for the matching only.
+Pairs are mutual nearest neighbours after a transformation. A linear map is iterated: it is fitted
+to the pairs that the previous one brings together. Distortion that is not known in advance is
+fitted by a cubic per chip, which is used for the matching only.
 """
 
 from __future__ import annotations

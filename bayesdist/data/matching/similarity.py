@@ -4,8 +4,6 @@ Triangles of neighbouring bright stars are looked up in a k-d tree of the triang
 list. Every two triangles of equal shape vote for a rotation, scale and shift. Votes of true pairs
 agree, while those of chance pairs are scattered over the parameter space. The best candidate is
 accepted if it brings far more stars together than a displaced list does.
-
-Triangles of neighbouring stars, and their votes for a rotation, a scale and a shift.
 """
 
 from __future__ import annotations

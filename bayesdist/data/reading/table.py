@@ -1,6 +1,8 @@
-"""Columns of Matches from any table-like object: astropy, pandas, Arrow, mappings, records.
+"""Conversion of tables to columns of Matches, and of arrays to a table that readers recognise.
 
-Table of detector positions with sky coordinates, under names that the readers recognise.
+A table may be any table-like object: an astropy, pandas or Arrow table, a mapping, or records.
+`sky_table` makes a table of detector positions and sky coordinates under names that the readers
+recognise.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Conversion of table columns to arrays; errors name the file, row and column.
+"""Conversion of table columns to arrays in known units; errors name the file, row and column.
 
-Resolution of units on reading: every unit of u and v becomes one of `UNITS`, or an error.
+On reading, u and v are converted to one of `UNITS`; a unit that cannot be converted is an error.
 """
 
 from __future__ import annotations
