@@ -1,15 +1,12 @@
-"""Statistics of tests: sums over clusters, efficient scores, and p-values.
+"""Statistics of tests: sums over clusters, efficient scores, p-values, and confidence intervals.
 
-Sums over detections with correlated errors: those of one star, one exposure, or one cell.
-
+**Sums over clusters.**  Detections of one star, one exposure or one cell have correlated errors.
 The variance of a statistic that is a sum over detections follows from the squares of its sums over
 such clusters, not from those of single detections.
 
-Efficient scores: columns of a likelihood, with the parameters of the model projected out.
-
-Tests add columns Z to the derivatives J of positions with respect to the parameters, which are
-nuisance parameters.  With H the curvature and g the gradient of each detection, and P and r the
-precision of the priors and their gradient,
+**Efficient scores.**  Tests add columns Z to the derivatives J of positions with respect to the
+parameters of the model, which are nuisance parameters and are projected out.  With H the curvature
+and g the gradient of each detection, and P and r the precision of the priors and their gradient,
 
     gain = C^-1 J^T H Z         C = J^T H J + P
     information = Z^T H Z - (J^T H Z)^T gain
@@ -17,7 +14,7 @@ precision of the priors and their gradient,
 
 If positions of stars are fitted, they are eliminated from all these sums first.
 
-P-values, their correction for the number of tests, and confidence intervals of fractions.
+**P-values** are corrected for the number of tests; confidence intervals are those of fractions.
 """
 
 from __future__ import annotations

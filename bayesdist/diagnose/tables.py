@@ -1,12 +1,11 @@
 """Errors of look-up tables between their nodes, from neighbouring stars in different exposures.
 
-Error of a look-up table between its nodes, measured rather than derived from smoothness.
-
-A table is bilinear between nodes, and the distortion is not.  Two stars at the same position in
-different exposures share the error of the table and nothing else: the mean product of their
-residuals is the mean square of that error.  The table and its polynomial were fitted to the same
-residuals and have absorbed part of them.  That part equals their posterior variance V, because a
-fit leaves residuals with the covariance N - V:
+A table is bilinear between nodes, and the distortion is not.  The error is measured rather than
+derived from smoothness.  Two stars at the same position in different exposures share the error of
+the table and nothing else: the mean product of their residuals is the mean square of that error.
+The table and its polynomial were fitted to the same residuals and have absorbed part of them.  That
+part equals their posterior variance V, because a fit leaves residuals with the covariance N - V,
+where N is that of the data.  The mean square is therefore
 
     S = <r_i r_j> + V          i, j: different stars, different exposures, same cell
 

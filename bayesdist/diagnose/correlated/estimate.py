@@ -1,6 +1,8 @@
 """Estimate the discrepancy between a solution and the truth from its residuals in one pass.
 
-Errors that a star of the catalogue has in all of its exposures, with their size marginalised.
+The discrepancy is structure that the model omits, and deviations of exposures. Errors that a
+star of the catalogue has in all of its exposures are estimated as well (`shared_stars`). The sizes
+of all of these are marginalised, with the priors in `bayesdist.diagnose.correlated.priors`.
 """
 
 from __future__ import annotations

@@ -1,18 +1,19 @@
-"""Sums over small cells of the detector, and their information on parameters and functions.
+"""Sums over small cells of the detector: information, and covariance from the scatter of scores.
 
 Scores, curvatures and squared scores are summed in one pass.  The cells are so small that all
 functions are nearly constant within a cell.  Later steps therefore do not need the stars again,
 however many there are.
 
-Covariance of parameters from the scatter of the stars, as far as the data require it.
+The covariance of the parameters follows from the scatter of the stars' scores g, as far as the data
+require it.  With A the information of the parameters, the sandwich A^-1 (sum of g g^T) A^-1 is
+valid for any variances of single stars, but its elements scatter like sums of squares.  Squared
+scores divided by (1 - l)^2, with l the leverage of a star (HC3 of MacKinnon and White 1985, Journal
+of Econometrics 29, 305), remain valid if stars of high leverage have larger errors than others, and
+are 1 / (1 - l) times too large if all stars are alike.  In that case the likelihood's covariance,
+multiplied by one factor for all stars, is exact.
 
-The sandwich A^-1 (sum of g g^T) A^-1 is valid for any variances of single stars, but its elements
-scatter like sums of squares.  Squared scores divided by (1 - l)^2, with l the leverage of a star
-(HC3 of MacKinnon and White 1985, Journal of Econometrics 29, 305), remain valid if stars of high
-leverage have larger errors than others, and are 1 / (1 - l) times too large if all stars are alike.
-In that case the likelihood's covariance, multiplied by one factor for all stars, is exact.
-
-Variance of the stars' scores over the detector, relative to the likelihood's prediction.
+`score_excess` maps the variance of the scores over the detector, relative to the likelihood's
+prediction.
 """
 
 from __future__ import annotations

@@ -1,32 +1,29 @@
-"""Structure finer than the functions, from products of the scores of neighbouring stars.
+"""Products of the scores of neighbouring stars: fine structure, and fields of single exposures.
 
-For the functions that the stars can resolve, a pattern of a few tens of pixels is hardly different
-from white noise, but neighbouring stars share it.  For stars with independent errors, scores g and
-curvatures h, a displacement with the covariance C(d) at the separation d gives
+For stars with independent errors, scores g and curvatures h, a displacement with the covariance
+C(d) at the separation d gives
 
     sum g_i g_j = C(d) sum h_i h_j
 
-on average over pairs.  The part that the functions resolve is subtracted from the scores first.
-With its posterior mean f and covariance S at the stars,
+on average over pairs i, j.
+
+**Structure finer than the functions.**  For the functions that the stars can resolve, a pattern of
+a few tens of pixels is hardly different from white noise, but neighbouring stars share it.  The
+part that the functions resolve is subtracted from the scores first.  With its posterior mean f and
+covariance S at the stars,
 
     C(d) sum h_i h_j = sum [(g_i - h_i f_i) (g_j - h_j f_j) + h_i h_j S_ij]
 
 so that C is the covariance of the finer structure.  Remainders of smoother structure are the same
 for pairs at slightly larger separations; only the difference to these is used.
 
-Products of neighbouring stars' scores within an exposure, compared with those across exposures.
-
-A field that differs between exposures (atmosphere, changing focus) displaces neighbours in one
-exposure together, and neighbours in different exposures independently.  A pattern of the detector
-affects both alike.  For stars with independent errors, scores g and curvatures h, a displacement
-with the covariance C(d) at the separation d gives
-
-    sum g_i g_j = C(d) sum h_i h_j
-
-on average over pairs.  The difference of the ratios within and across exposures is the covariance
-of a field of single exposures.  Terms up to second order of each exposure are subtracted first,
-because they have separate tests and error terms.  Products are summed over the cells of a grid by
-Fourier transforms, so that the time grows with the number of stars rather than of pairs.
+**Fields of single exposures.**  A field that differs between exposures (atmosphere, changing focus)
+displaces neighbours in one exposure together, and neighbours in different exposures independently.
+A pattern of the detector affects both alike.  The difference of the ratios sum g_i g_j / sum h_i
+h_j within and across exposures is therefore the covariance of a field of single exposures.  Terms
+up to second order of each exposure are subtracted first, because they have separate tests and error
+terms.  Products are summed over the cells of a grid by Fourier transforms, so that the time grows
+with the number of stars rather than of pairs.
 """
 
 from __future__ import annotations

@@ -1,30 +1,28 @@
-"""Prediction of held-out stars, and their comparison with it.
+"""Prediction of stars that were not fitted, and comparison of held-out stars with it.
 
-Prediction of a star that was not fitted: mean, covariance, and false matches.
+The predictive density of the residual r of a star is
 
     p(r) = (1 - f) N(r; 0, S) + f p_out(r)      S = diag(s_u^2 + j^2, s_v^2 + j^2) + J C J^T
 
-Here s are the star's quoted errors, j is the jitter, and C is the covariance of the solution at the
-star's position.  For a campaign, S also includes the errors of the look-up tables at the position.
-In addition, the scatter of the exposures is known, and the part of s that is due to the catalogue.
+with the fraction f and the density p_out of false matches.  Here s are the star's quoted errors, j
+is the jitter, J are the derivatives of the position with respect to the parameters, and C is the
+covariance of the parameters.  For a campaign, S also includes the errors of the look-up tables at
+the position.  In addition, a prediction knows the scatter of the exposures, and the part of s that
+is due to the catalogue.
 
-Held-out stars compared with their prediction, group by group.
+Held-out stars are compared with their prediction group by group.  A star of an exposure that was
+fitted is predicted directly.  An exposure that was held out entirely has no frame yet: a frame is
+fitted to its stars, and what the stars lose to it is subtracted from the covariance of their
+residuals.  If the polynomials belong to no exposure, they and the residuals are along the detector
+axes: errors that are fixed on the detector would otherwise average out over exposures of many roll
+angles.
 
-A star of an exposure that was fitted is predicted directly.  An exposure that was held out entirely
-has no frame yet: a frame is fitted to its stars, and what the stars lose to it is subtracted from
-the covariance of their residuals.
-
-If the polynomials belong to no exposure, they and the residuals are along the detector axes: errors
-that are fixed on the detector would otherwise average out over exposures of many roll angles.
-
-Frames of exposures that were held out entirely, fitted to their stars.
-
-The prior on a campaign's exposures, their scatter, enters the fit.  Let F be the information of the
-stars, P the precision of the scatter, A the derivatives of positions with respect to the frame, and
-Sigma the errors of the stars without those of the solution.  The error of the fitted frame then has
-the covariance (F + P)^-1, and the residuals have the covariance Sigma - A (F + P)^-1 A^T instead of
-Sigma + A P^-1 A^T.  P is zero without a prior.  The result holds if the weights are the inverse of
-Sigma.
+**Frames of exposures that were held out entirely.**  The prior on a campaign's exposures, their
+scatter, enters the fit.  Let F be the information of the stars, P the precision of the scatter, A
+the derivatives of positions with respect to the frame, and Sigma the errors of the stars without
+those of the solution.  The error of the fitted frame then has the covariance (F + P)^-1, and the
+residuals have the covariance Sigma - A (F + P)^-1 A^T instead of Sigma + A P^-1 A^T.  P is zero
+without a prior.  The result holds if the weights are the inverse of Sigma.
 """
 
 from __future__ import annotations

@@ -1,19 +1,16 @@
 """Sums over held-out stars for all tests, accumulated in one pass.
 
-Sums over groups of held-out stars, and their covariance through what all predictions share.
+**Groups of stars.**  Every statistic is a sum of terms, one per star, with zero expectation if the
+prediction is correct.  Its derivative with respect to a parameter of the prediction is the sum of
+term times score, so that the covariances of the solution's parameters, of the mixture's parameters
+and of fitted frames, which all predictions share, can be propagated.
 
-Every statistic is a sum of terms, one per star, with zero expectation if the prediction is correct.
-Its derivative with respect to a parameter of the prediction is the sum of term times score, so that
-the covariances of the solution's parameters, of the mixture's parameters and of fitted frames can
-be propagated.
-
-Errors that matches share: those of a star, and those of a position on the detector.
-
-A star of the catalogue has the same error in all exposures.  Errors of a look-up table, or of
-structure that the model lacks, are the same for all stars in a cell of the detector.  Sums over
-matches therefore vary by more than those of independent matches.  The variance of position scores
-follows from the squares of their sums per star, and that of counts from sums per cluster.  For
-spread scores,
+**Errors that matches share.**  A star of the catalogue has the same error in all exposures.  Errors
+of a look-up table, or of structure that the model lacks, are the same for all stars in a cell of
+the detector.  Sums over matches therefore vary by more than those of independent matches.  The
+variance of position scores follows from the squares of their sums per star, and that of counts from
+sums per cluster, which is a star or a cell.  The spread scores of matches are their chi-squares q
+minus the expectation, weighted with the probability of a true match.  For these,
 
     cov(q_i, q_j) = 4 c_i c_j      c = (shared error)^2 / (total error)^2
 

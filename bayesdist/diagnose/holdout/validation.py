@@ -1,6 +1,4 @@
-"""Hold-out validation: stars that were set aside before the fit, compared with its predictions.
-
-Tests of held-out stars, computed from sums over them.
+"""Hold-out validation: tests of stars that were set aside before the fit against its predictions.
 
 All statistics are sums of scores, which have zero mean if the prediction is correct.  They vary
 with the single stars, and jointly through everything that all predictions share: the parameters of

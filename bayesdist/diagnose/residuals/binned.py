@@ -1,8 +1,7 @@
-"""Residuals averaged over the detector, and their statistics.
+"""Residuals averaged over the detector, their statistics, and the area that the stars cover.
 
-Part of a chip that the stars cover; outside of it a polynomial is extrapolated.
-
-The formal and posterior errors are valid there only if the model is, and no star can test that.
+Outside of the area of a chip that its stars cover, a polynomial is extrapolated.  The formal and
+posterior errors are valid there only if the model is, and no star can test that.
 """
 
 from __future__ import annotations

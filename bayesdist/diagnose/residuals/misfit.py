@@ -1,10 +1,9 @@
-"""Does the model describe the stars?  Structure in the residuals, and inconsistent errors.
+"""Does the model describe the stars?  Structure in the residuals, and quoted errors that are wrong.
 
 The posterior is conditional on the model.  If the model lacks structure, its uncertainty does not
 include that structure, and no requirement can be called met.
 
-Quoted errors that are far too small, and matches that are mostly false, with warnings.
-
+Quoted errors may be far too small, and matches may be mostly false; there is a warning for each.
 Jitter compensates for errors that are a few times too small.  If they are far smaller, the
 differences between stars would be lost in the jitter.  All errors are therefore multiplied by the
 factor that the residuals show.

@@ -1,11 +1,8 @@
-"""Residuals of stars at a solution: a sample of them, and sums over all.
+"""Residuals of stars at a solution: a sample of them, and sums over all stars in one pass.
 
-A sample of the stars with residuals and probabilities, and their scatter.
-
-Sums over all stars at a solution, in one pass over the data.
-
-The functions that process a shard are module-level functions, so that they can be sent to other
-processes.  Their results are added.
+The sample contains residuals and probabilities of stars, and gives the scatter by magnitude.  The
+functions that sum over a shard of the data are module-level functions, so that they can be sent to
+other processes.  Their results are added.
 """
 
 from __future__ import annotations

@@ -1,10 +1,8 @@
 """Tables of statistics of binned residuals with errors, in the layout of WSDC D-T033.
 
-One row of a residual table: each statistic with its error, and corrected for noise.
-
 Means of bins contain the mean errors of their stars in addition to what the model lacks.  For every
-statistic the row therefore has an error, the scatter that other stars in the same bins would cause,
-and a noise-free value, the expectation for infinitely many stars.
+statistic a row of a table therefore has an error, the scatter that other stars in the same bins
+would cause, and a noise-free value, the expectation for infinitely many stars.
 
 Differences between all pairs of bins are never listed: 45 x 45 bins have four million.  Their mean,
 sigma and extremes have closed forms.  An order statistic is found by counting: the number of

@@ -1,21 +1,21 @@
-"""Tests for deviations of single exposures: linear terms that frames do not fit, and second order.
+"""Tests for deviations of single exposures: linear and second-order terms, trends, smooth fields.
 
-Every exposure e has a statistic T_e for the shift, rotation, scale and shears that are not
-parameters of its frame, or for second-order terms on every chip, with all linear terms projected
-out.  T_e is a chi-square with the same probability as Hotelling's statistic, using the covariance
-of the scores of the exposure's stars.  Each exposure deviates independently, so that the sum of the
-T_e is tested; this does not need the covariance of hundreds of scores.  The polynomials, which are
-fitted to all exposures, make the T_e slightly dependent.  The mean and variance of the sum are
-therefore those of a scaled chi-square (Satterthwaite 1946).
+**Linear terms that frames do not fit, and second order.**  Every exposure e has a statistic T_e for
+the shift, rotation, scale and shears that are not parameters of its frame, or for second-order
+terms on every chip, with all linear terms projected out.  T_e is a chi-square with the same
+probability as Hotelling's statistic, using the covariance of the scores of the exposure's stars.
+Each exposure deviates independently, so that the sum of the T_e is tested; this does not need the
+covariance of hundreds of scores.  The polynomials, which are fitted to all exposures, make the T_e
+slightly dependent.  The mean and variance of the sum are therefore those of a scaled chi-square
+(Satterthwaite 1946).
 
-Test whether deviations of exposures are correlated in time, beyond the drift and a parabola.
+**Correlation in time.**  `exposure_time_test` examines whether the deviations of exposures are
+correlated in time, beyond the drift and a parabola.
 
-Test for smooth fields that differ from exposure to exposure, from products of nearby stars.
-
-The sum of products within exposures, minus that across exposures, is weighted according to the
-signal of a field with a given correlation length.  It is a quadratic form of independent scores, so
-that its distribution is approximated by a chi-square with the same skewness.  A few correlation
-lengths are tried.
+**Smooth fields that differ from exposure to exposure.**  The sum of products of nearby stars within
+exposures, minus that across exposures, is weighted according to the signal of a field with a given
+correlation length.  It is a quadratic form of independent scores, so that its distribution is
+approximated by a chi-square with the same skewness.  A few correlation lengths are tried.
 """
 
 from __future__ import annotations

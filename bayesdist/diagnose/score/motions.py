@@ -1,31 +1,29 @@
 """Tests for motions that are not fitted: of the stars, and of the chips.
 
-Test for unmodelled proper motions: do the residuals of a star change with time?
-
-For each star, the squared score of the slope is compared with the squared scores of its single
-detections, after position and slope have been fitted.  Nothing is therefore assumed about the size
-of the errors.  Let b_s be the slope of star s, S_s its information with the star's position
-projected out, p_i the scores of the detections for the slope, corrected for the leverage of
-position and slope (HC2), and C_s the covariance that the catalogue states for the motion.  Then
+**Proper motions.**  Do the residuals of a star change with time?  For each star, the squared score
+of the slope is compared with the squared scores of its single detections, after position and slope
+have been fitted.  Nothing is therefore assumed about the size of the errors.  Let b_s be the slope
+of star s, S_s its information with the star's position projected out, p_i the scores of the
+detections for the slope, corrected for the leverage of position and slope (HC2), and C_s the
+covariance that the catalogue states for the motion.  Then
 
     D_s = [b_s^T S_s b_s - sum_i p_i^T S_s^-1 p_i - tr(S_s C_s)] / 2
 
 has zero mean if the stars move as the catalogue states.
 
-Test of the gap: do the chips move relative to each other with time, in a way that is not fitted?
-
-For every exposure, the shift of each chip relative to the first chip, and its rotation about its
-own reference pixel, are fitted together with terms common to all chips: shift, rotation, scale and
-shears.  Scale and shears act about each chip's reference pixel, like the drifting terms of a model,
-so that they do not change the gap; those of a frame that all chips share act about the origin of
-the frame.  A linear trend is fitted to these values,
+**The gap between chips.**  Do the chips move relative to each other with time, in a way that is not
+fitted?  For every exposure, the shift of each chip relative to the first chip, and its rotation
+about its own reference pixel, are fitted together with terms common to all chips: shift, rotation,
+scale and shears.  Scale and shears act about each chip's reference pixel, like the drifting terms
+of a model, so that they do not change the gap; those of a frame that all chips share act about the
+origin of the frame.  A linear trend is fitted to these values,
 
     d_e = d_0 + rate (t_e - t_0) + noise        F = rate^2 / var(rate)
 
-The noise is the scatter of whole visits about the trend, so that chips which move to and fro do not
-count as drifting.  Errors of catalogue stars, which follow a chip through all exposures if the roll
-angles are similar, are added to var(rate).  The largest F is tested, and its p-value is corrected
-for the number of trends (Sidak 1967).
+for exposure e at the date t_e.  The noise is the scatter of whole visits about the trend, so that
+chips which move to and fro do not count as drifting.  Errors of catalogue stars, which follow a
+chip through all exposures if the roll angles are similar, are added to var(rate).  The largest F is
+tested, and its p-value is corrected for the number of trends (Sidak 1967).
 """
 
 from __future__ import annotations

@@ -1,23 +1,20 @@
 """Tests for patterns of the detector: jumps, repeating patterns, and rings.
 
-Test for jumps: residuals that differ between both sides of a column or row of the detector.
+**Jumps** are residuals that differ between both sides of a column or row of the detector.  The
+boundaries of amplifiers, stitched masks, strips of the field from another epoch or list, and plates
+of a catalogue are lines.  A polynomial bends to follow such a step, and a smooth field rounds it
+off; neither includes the remaining residuals, which extend over much of the detector.  At each of
+`EDGES` columns and rows of a chip, the score of a step is tested using its sandwich covariance.
+The step is orthogonal to polynomials along its axis up to `HIGHER` orders above the model's.  The
+p-value of the most significant edge is multiplied by the number of edges (Bonferroni).
 
-The boundaries of amplifiers, stitched masks, strips of the field from another epoch or list, and
-plates of a catalogue are lines.  A polynomial bends to follow such a step, and a smooth field
-rounds it off; neither includes the remaining residuals, which extend over much of the detector.
+**Patterns that repeat** over the detector are peaks in the spectrum of the scores.
 
-At each of `EDGES` columns and rows of a chip, the score of a step is tested using its sandwich
-covariance.  The step is orthogonal to polynomials along its axis up to `HIGHER` orders above the
-model's.  The p-value of the most significant edge is multiplied by the number of edges
-(Bonferroni).
-
-Test for a pattern that repeats over the detector: a peak in the spectrum of the scores.
-
-Rings about a centre inside or outside the detector, such as the tree rings of thick silicon.
-
+**Rings** have a centre inside or outside the detector, such as the tree rings of thick silicon.
 The spacing of the rings decreases as the inverse of the radius, so that their phase is quadratic in
-the position, kappa |x - c|^2.  Multiplied by exp(-i kappa |x|^2), the rings become plane waves with
-the frequency 2 kappa c: one Fourier transform per kappa examines all centres c.
+the position x, kappa |x - c|^2 with the centre c.  Multiplied by exp(-i kappa |x|^2), the rings
+become plane waves with the frequency 2 kappa c: one Fourier transform per kappa examines all
+centres.
 """
 
 from __future__ import annotations

@@ -10,8 +10,6 @@ there are stars, because stars near the edge, and stars whose errors are quoted 
 largest weight.  T is distributed like Hotelling's statistic (Bell and McCaffrey 2002; Pustejovsky
 and Tipton 2018).
 
-Regressors of matched stars with the parameters projected out, and their values at detections.
-
 The regressors of a test are functions of the detections.  No array has both the length of the
 detections and the width of parameters or regressors, because each block's polynomials have only a
 few coefficients.

@@ -1,10 +1,8 @@
 """Questions of the score tests: functions that a model may lack, each with its wording.
 
-The list serves matched stars, campaigns and self-calibrations.  The functions determine everything
-else: how parameters and stars are projected out of them, the statistic, its p-value and the
-smallest effect that would have been detected.
-
-Functions of the detections that the score tests add to the model, with their indices.
+The list serves matched stars, campaigns and self-calibrations.  The functions of the detections
+that a question adds to the model determine everything else: how parameters and stars are projected
+out of them, the statistic, its p-value and the smallest effect that would have been detected.
 """
 
 from __future__ import annotations

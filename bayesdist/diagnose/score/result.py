@@ -1,6 +1,6 @@
-"""Results of tests for what a model may lack, and their correction for multiple testing.
+"""Results of tests for what a model may lack: multiple testing, and precedence among findings.
 
-Precedence among findings: causes, and the symptoms that they produce in other tests.
+P-values are corrected for the number of tests.
 
 One fault of the data affects several tests.  The remedy of a symptom does not help while the cause
 persists: a higher order does not help if a ghost displaces stars, and errors that depend on
