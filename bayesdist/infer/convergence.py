@@ -1,12 +1,12 @@
 """Convergence diagnostics, computed over independent ensembles rather than over coupled walkers.
 
+Chains have the shape (chains, draws, parameters) = (C, N, D).  Each chain is split into halves,
+which are compared like separate chains.  R-hat and effective sample sizes equal those of ArviZ,
+which computes them one parameter at a time.  A parameter with a NaN among its draws gets NaN.
+
 Differential evolution couples the walkers of an ensemble.  In that case the effective sample size
 is the smaller of two estimates: that of the concatenated walkers, and that of the ensemble
 averages, which reveals a drift common to all walkers (Goodman and Weare 2010, section 5).
-
-The results equal those of ArviZ, which computes them one parameter at a time.  Chains have the
-shape (chains, draws, parameters) = (C, N, D).  Each chain is split into halves, which are compared
-like separate chains.  A parameter with a NaN among its draws gets NaN.
 """
 
 from __future__ import annotations

@@ -1,10 +1,9 @@
 """Effective coefficients: the polynomial of the pixels for one chip, exposure and epoch.
 
-Fits, samplers and predictions use a model only through the map from theta to the effective
-coefficients and the derivatives of this map.
-
 For one chip, exposure and epoch the complete model (polynomial, time dependence, frame) is a single
-polynomial of the pixel position.  The data constrain the parameters only through these polynomials.
+polynomial of the pixel position.  The data constrain the parameters theta only through these
+polynomials.  Fits, samplers and predictions therefore use a model only through the map from theta
+to the effective coefficients and the derivatives of this map.
 """
 
 from __future__ import annotations

@@ -1,20 +1,23 @@
-"""Exposure frames: the transformation T_e of one exposure by shift, rotation, scale and shear.
+"""Exposure frames: the transformation T of one exposure by shift, rotation, scale and shear.
 
     T(w) = o + d + M (w - o)
     M = R(rotation) [(1 + scale) I + shear_plus diag(1, -1) + shear_cross offdiag(1, 1)]
 
-The origin o is fixed such that shifts and linear terms are nearly uncorrelated.  R rotates from u
-towards v by an angle in radians.  Each kind of frame adds parameters to the previous kind.  Scale
-and shear act along the axes of w, before the rotation.  They are therefore deviations of the
+for a position w = (u, v), with the shift d.  The origin o is fixed such that shifts and linear
+terms are nearly uncorrelated.  R rotates from u towards v by an angle in radians.  Each kind of
+frame adds parameters to the previous kind.  Near zero, with the quarter turn J,
+
+    M = I + scale I + rotation J + shear_plus diag(1, -1) + shear_cross offdiag(1, 1)
+
+Scale and shear act along the axes of w, before the rotation.  They are therefore deviations of the
 detector, small at any roll angle, for which independent Gaussian priors are appropriate.
-Near zero, M = I + scale I + rotation J + shear_plus diag(1, -1) + shear_cross offdiag(1, 1).
 
 A chip may deviate from the first chip.  About the position c of its reference pixel,
 
     w -> w + d + L (w - c)      L = scale I + rotation J + shear_plus diag(1, -1) + shear_cross ...
 
-The deviations are small, so that they are linearised.  Scale and shear of the frame then also act
-about c.
+with the shift d, scale, rotation and shears of this chip.  The deviations are small, so that they
+are linearised.  Scale and shear of the frame then also act about c.
 """
 
 from __future__ import annotations

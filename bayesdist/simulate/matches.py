@@ -1,7 +1,7 @@
 """Simulated matches with measurement errors and false matches.
 
-The matches follow a given distortion model, or are a SExtractor catalogue of one exposure that is
-matched to Gaia.
+`simulate_matches` follows a given distortion model; `simulate_partitioned` writes such matches in
+chunks.  `matched_to_gaia` simulates a SExtractor catalogue of one exposure that is matched to Gaia.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
-"""Conversion of quantities, dates, directions and seeds from users into plain numbers.
+"""Conversion of arguments from users into plain numbers, and type checks of arguments.
 
-Type checks for the arguments of public functions.
+Quantities, dates, directions and seeds are converted.  The decorator `takes` checks the types of
+the arguments of public functions.
 """
 
 from __future__ import annotations

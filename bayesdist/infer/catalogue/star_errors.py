@@ -2,25 +2,19 @@
 
 A fit treats every match as an independent measurement, with the catalogue's error included in its
 sigma.  The position of a star in the catalogue, however, has the same error in all exposures, and
-so has its proper motion.  This part of the error does not average out.  With the normal matrix H
-and the sums G_s over all matches of star s (`star_sums`),
+so has its proper motion.  This part of the error does not average out.  Catalogue errors with the
+covariance Sigma_s of each star s cause the covariance
 
-    cov = H^-1 [sum_s G_s Sigma_s G_s^T] H^-1
+    cov = H^-1 [sum_s G_s Sigma_s G_s^T] H^-1        G_s = sum_i a_i J_i^T W_i
 
-is the covariance of the parameters caused by the catalogue errors Sigma_s.  The covariance of the
-fit already includes the diagonal part, sum_i instead of (sum_i)^2.
+of the parameters.  H is the normal matrix, and i are the matches of star s, with the weights W_i
+and the derivatives J_i of the position with respect to the parameters.  a_i is the derivative of
+the match's position with respect to the error: 1 for a position, t - t0 for a proper motion.  The
+covariance of the fit already includes the diagonal part, sum_i instead of (sum_i)^2.
 
-An error c_s of star s changes the parameters by H^-1 G_s c_s.  If the star is observed in another
-exposure that was not part of the fit, its error is therefore correlated with that of the solution:
-cov(c_s, theta) = Sigma_s (H^-1 G_s)^T.
-
-For star s with matches i, the sums are
-
-    G_s = sum_i a_i J_i^T W_i
-
-with weights W and derivatives J of the positions with respect to the parameters.  a_i is the
-derivative of the match's position with respect to the error: 1 for a position, t - t0 for a proper
-motion.
+An error c_s of star s changes the parameters theta by H^-1 G_s c_s.  If the star is observed in
+another exposure that was not part of the fit, its error is therefore correlated with that of the
+solution: cov(c_s, theta) = Sigma_s (H^-1 G_s)^T.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
-"""Linear algebra of covariances and normal matrices that are scaled to unit diagonal.
+"""Linear algebra of covariances and normal matrices, and chi-square tests with them.
 
-The parameters of a model differ by many orders of magnitude; scaling avoids the loss of digits.
+The parameters of a model differ by many orders of magnitude.  Matrices are therefore scaled to unit
+diagonal, which avoids the loss of digits.
 
 The chi-square of a difference between polynomials can exclude some fields (such as a shift).  The
 result does not depend on how these fields were removed: any linear projection along them, applied

@@ -1,11 +1,12 @@
 """Look-up table of one filter: as a Gaussian random field, or as smoothed means of bins.
 
-The stars sample the random field bilinearly.  The other table follows ISR 2015-06, section
-4.3.1: residuals are averaged in bins of 64 x 64 pixels with iterative
-sigma clipping.  The grid is then smoothed with a 5 x 5 quadratic kernel: each node gets the value
-of a quadratic surface fitted with equal weights to the 25 values around it (Anderson and King 2000,
-PASP 112, 1360).  Away from edges and empty bins this equals their fixed kernel, with 27/175 at the
-centre.  Near an edge or an empty bin the surface is fitted to the available values.
+`field_table` computes the posterior of a random field, which the stars sample bilinearly.
+
+`binned_table` follows ISR 2015-06, section 4.3.1: residuals are averaged in bins of 64 x 64 pixels
+with iterative sigma clipping.  The grid is then smoothed with a 5 x 5 quadratic kernel: each node
+gets the value of a quadratic surface fitted with equal weights to the 25 values around it (Anderson
+and King 2000, PASP 112, 1360).  Away from edges and empty bins this equals their fixed kernel, with
+27/175 at the centre.  Near an edge or an empty bin the surface is fitted to the available values.
 """
 
 from __future__ import annotations

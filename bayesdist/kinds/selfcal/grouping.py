@@ -1,16 +1,14 @@
 """Detections of one field matched with each other, without a catalogue.
 
-Linear maps of the exposures of one field onto the first exposure, without a catalogue.
+**Maps between exposures.**  Linear maps bring the exposures of one field onto the plane of the
+first exposure. Each exposure is recognised by the patterns of its bright stars among the stars of
+the exposures that are already mapped. Its remaining stars are then added to these. Exposures that
+do not overlap with the first one are thereby connected through others.
 
-Each exposure is recognised by the patterns of its bright stars among the stars of the exposures
-that are already mapped. Its remaining stars are then added to these. Exposures that do not overlap
-with the first one are thereby connected through others.
-
-Grouping of detections into stars by friends of friends, on positions common to all exposures.
-
-The sky is divided into cells that are grouped separately, each with a margin around it. A group
-belongs to the cell of its first detection and extends no farther than `MAX_EXTENT`, so that it is
-complete in that cell: groups do not depend on the division of the sky.
+**Stars.**  Detections are grouped into stars by friends of friends, on positions common to all
+exposures. The sky is divided into cells that are grouped separately, each with a margin around it.
+A group belongs to the cell of its first detection and extends no farther than `MAX_EXTENT`, so that
+it is complete in that cell: groups do not depend on the division of the sky.
 """
 
 from __future__ import annotations

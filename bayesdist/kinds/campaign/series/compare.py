@@ -1,10 +1,10 @@
 """Selection of the trend of a series by the predictive density of held-out exposures.
 
-A difference is significant if it is at least 4, and significant at 95 % according to Student's t
-with its standard error.  For differences below 4, the standard errors are too small (Sivula et al.
-2020).  If the exposures are correlated in time, blocks of consecutive exposures are held out.
-Otherwise the neighbours of an exposure would predict it, and an irregular drift would look like a
-line.
+A difference between the log predictive densities of two trends is significant if it is at least 4,
+and significant at 95 % according to Student's t with its standard error.  For differences below 4,
+the standard errors are too small (Sivula et al. 2020).  If the exposures are correlated in time,
+blocks of consecutive exposures are held out.  Otherwise the neighbours of an exposure would predict
+it, and an irregular drift would look like a line.
 
 To test whether the drift depends on the filter (Kozhurina-Platais et al. 2015, section 4.4.4),
 common slopes with an offset per filter are compared with a slope per filter.  The slope of each

@@ -1,9 +1,9 @@
-"""Information and scores of parameters and added functions, with the stars eliminated.
+"""Information and scores of a self-calibration with the stars eliminated.
 
-The parameters, functions over a chip, and deviations of an exposure displace its detections, and
-the fitted positions of stars follow.  Let Z and S be the derivatives of positions with respect to
-all these columns and to a star's parameters, and H and g the curvature and gradient of each
-detection.  Then
+**Elimination.**  The parameters, functions over a chip, and deviations of an exposure displace its
+detections, and the fitted positions of stars follow.  Let Z and S be the derivatives of positions
+with respect to all these columns and to a star's parameters, and H and g the curvature and gradient
+of each detection.  Then the information N and the score of the columns are
 
     N = sum Z^T H Z - sum_s T^T A^-1 T        T = sum S^T H Z,  A = sum S^T H S + prior
     score = sum Z^T g - sum_s T^T A^-1 b      b = sum S^T g - pull of the prior
@@ -11,9 +11,11 @@ detection.  Then
 where the sums over s include all stars, and those within T, A and b the detections of a star.
 Polynomials and functions over a chip are dense columns, parameters of single exposures sparse ones.
 
-Scores of single detections of a self-calibration, and the fraction of them that stars absorb.
+**Single detections.**  The scores of the detections, and the fraction of their variance that the
+stars absorb, are computed with the stars at their modes.
 
-Covariance of a self-calibration from the scatter of the scores of its stars.
+**Scatter of the stars.**  The scores of a star's detections are summed, and the squares of these
+sums give the covariance of the parameters from the scatter of the stars.
 """
 
 from __future__ import annotations

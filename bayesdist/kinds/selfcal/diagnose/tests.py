@@ -1,16 +1,16 @@
 """Tests of the residuals of self-calibrations, with the stars eliminated.
 
-The questions of the score tests are those for matched stars (`diagnose.score.questions`).  The
+**Score tests.**  The questions are those for matched stars (`diagnose.score.questions`).  The
 positions of stars are among the parameters that are projected out, and the scores of a star's
 detections are summed. Effects that the stars absorb cannot be tested: directions that would be far
 better determined if the stars were known are left out.
 
-Does the model describe the detections if the positions of stars are fitted with it?
-
+**Misfit.**  Does the model describe the detections if the positions of stars are fitted with it?
 Stars absorb part of any pattern that is fixed on the detector: all of it if the exposures are not
 dithered, and next to nothing if a star's many detections are far apart.  The test is therefore for
 shifts of cells that the model lacks, with the stars eliminated.  Let g be the gradient of the log
-density with respect to these shifts and C their curvature (Rao's score test):
+density with respect to these shifts, C their curvature and C^+ its pseudo-inverse.  Rao's score
+test is
 
     g^T C^+ g
 

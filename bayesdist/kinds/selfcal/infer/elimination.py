@@ -1,8 +1,9 @@
-"""Normal equations of the distortion with the stars eliminated.
+"""Normal equations of the distortion with the stars eliminated, and passes over pieces of the data.
 
 For star s, let A_s be minus the second derivatives of the log density with respect to the star's
-parameters, and B_s the mixed ones with respect to those and the parameters of the model.  The
-elimination of all stars gives
+parameters, and B_s the mixed ones with respect to those and the parameters of the model.  With the
+derivatives J_i of position i with respect to the parameters of the model and the curvature H_i of
+its log density, the elimination of all stars gives
 
     N = sum_i J_i^T H_i J_i - sum_s B_s^T A_s^-1 B_s
 
@@ -10,9 +11,9 @@ for the parameters of distortion and exposures.  The B_s of about a thousand sta
 matrix, so that the second sum is a matrix product.
 
 Passes over the detections are made piece by piece, in this process or on a cluster.  A piece
-contains all detections of some stars, and the stars at the current solution.  Its next
-state and its contribution to any sum depend only on the piece and on the parameters.  Therefore
-stars are not transferred, and a lost piece can be computed again from its detections.
+contains all detections of some stars, and the stars at the current solution.  Its next state and
+its contribution to any sum depend only on the piece and on the parameters.  Therefore stars are not
+transferred, and a lost piece can be computed again from its detections.
 """
 
 from __future__ import annotations

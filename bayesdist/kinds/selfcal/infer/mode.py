@@ -1,13 +1,14 @@
-"""Joint mode of distortion, frames, stars and memberships, in a gauge that is decided there.
+"""Joint mode of distortion, frames, stars and memberships, in a gauge determined at the mode.
 
 Free directions are determined at a solution, but finding a solution requires that parameters are
 fixed.  With the large errors of a starting point, more directions seem free than at the mode; for
 example if roll angles hardly differ.  The free directions are therefore determined again at the
 mode, and the decision is stored with the solution for later use.
 
-The covariance expected for planned exposures is that of the mode for simulated detections.  It
-depends only on the positions of the stars: residuals would enter the information only through the
-membership probabilities, and all simulated detections are at the positions of their stars.
+`expected_solution` gives the covariance that is expected for planned exposures: that of the mode
+for simulated detections.  It depends only on the positions of the stars: residuals would enter the
+information only through the membership probabilities, and all simulated detections are at the
+positions of their stars.
 """
 
 from __future__ import annotations

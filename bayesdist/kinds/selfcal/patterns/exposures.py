@@ -1,7 +1,7 @@
 """Simulated dithered exposures of a dense field, and dither patterns.
 
-The simulations contain the pointings and the pixel positions of the stars.  Dither patterns are
-pointings and roll angles of exposures.
+A dither pattern consists of the pointings and roll angles of exposures.  The simulations contain
+the pointings and the pixel positions of the stars.
 """
 
 from __future__ import annotations
