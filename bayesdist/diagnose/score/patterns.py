@@ -12,8 +12,8 @@ p-value of the most significant edge is multiplied by the number of edges (Bonfe
 
 **Rings** have a centre inside or outside the detector, such as the tree rings of thick silicon.
 The spacing of the rings decreases as the inverse of the radius, so that their phase is quadratic in
-the position x, kappa |x - c|^2 with the centre c.  Multiplied by exp(-i kappa |x|^2), the rings
-become plane waves with the frequency 2 kappa c: one Fourier transform per kappa examines all
+the position x, ``kappa |x - c|^2`` with the centre c.  Multiplied by ``exp(-i kappa |x|^2)``, the
+rings become plane waves with the frequency 2 kappa c: one Fourier transform per kappa examines all
 centres.
 """
 
