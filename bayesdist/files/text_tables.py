@@ -7,7 +7,7 @@ import io
 import logging
 import re
 from collections.abc import Mapping, Sequence
-from itertools import takewhile
+from itertools import chain, takewhile
 
 from astropy.table import Table
 
@@ -28,6 +28,7 @@ _FOREIGN = re.compile(
     r"[+-]?(0[xX][0-9a-fA-F.]+([pP][+-]?\d+)?"
     r"|(?=.*(_|[^\x00-\x7f]))[\d_]*\.?[\d_]*\d([eE][+-]?[\d_]+)?\.?)"
 )
+_END = "\x00end\n"  # in no file of text
 _BLANKS = " \t\r\n"  # around a number; Python strips those of Unicode, too
 _MARKS = (",", ";", "\t", None)  # None: blanks
 ROWS_ABOVE, FEWEST_ABOVE = 20, 3  # number of rows with which the last cell is compared
@@ -250,27 +251,36 @@ def refuse_missing_cells(lines: Sequence[str], mark: str, *, where: str) -> None
 def refuse_open_quotes(lines: Sequence[str], table: Table, mark: str | None, *, where: str) -> None:
     """Raise FormatError if a quotation mark that is not closed has swallowed rows.
 
-    The cell that it opens then has line breaks, and at least one number for each column of numbers
-    in the table. Line breaks alone are allowed. `mark`: separator of cells; None for blanks.
+    The cell that it opens then goes on to the end of the file, or has line breaks and at least one
+    number or empty cell for each column of numbers in the table. Line breaks alone are allowed.
+    `mark`: separator of cells; None for blanks.
     """
     if not any('"' in line for line in lines):
         return
     fewest = max(1, sum(columns_of_numbers(table).values()))
     bare = ("\n" if line[:1] in ("#", "\\", "|") else line.rstrip("\r\n") + "\n" for line in lines)
-    records = csv.reader(bare, delimiter=mark or " ", skipinitialspace=True)
+    # an open cell takes up the line that is added
+    records = csv.reader(chain(bare, [_END]), delimiter=mark or " ", skipinitialspace=True)
     first = 1  # line in which a row begins
     for cells in records:
-        for cell in cells:
-            inside = cell.split("\n") if "\n" in cell.rstrip("\n") else []
-            words = [word.strip(_BLANKS) for line in inside for word in line.split(mark or " ")]
-            if sum(_NUMBER.fullmatch(word) is not None for word in words) >= fewest:
-                raise FormatError(
-                    f'a cell begins with a quotation mark (") and goes on through {len(inside)} '
-                    "lines, so that rows are lost within it",
-                    where=f"{where}, line {first}",
-                    do="close or remove the quotation mark",
-                )
+        spanned = [cell for cell in cells if "\n" in cell] if records.line_num > first else []
+        if any(_END in cell or _numbers_within(cell, mark) >= fewest for cell in spanned):
+            raise FormatError(
+                'a cell begins with a quotation mark (") that is not closed, so that rows are lost '
+                "within it",
+                where=f"{where}, line {first}",
+                do="close or remove the quotation mark",
+            )
         first = records.line_num + 1
+
+
+def _numbers_within(cell: str, mark: str | None) -> int:
+    """Number of numbers, and of empty cells between separators, in the lines of a cell."""
+    lines = [line.split(mark) for line in cell.splitlines()]
+    words = [
+        word.strip(_BLANKS) for line in lines if len(line) > 1 or line != [""] for word in line
+    ]
+    return sum(not word or _NUMBER.fullmatch(word) is not None for word in words)
 
 
 def refuse_cut_end(lines: Sequence[str], mark: str | None, *, where: str) -> None:

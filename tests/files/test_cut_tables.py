@@ -96,6 +96,22 @@ def test_the_line_of_an_open_quotation_mark_counts_comments(tmp_path, first):
         read_table(path)
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        'name,x,y,u,v\na,1,2,3,4\n"b,1,2,3,4\n',  # in the last row
+        'name,x,y,u,v\na,1,2,3,4\nb,1,2,3,"4\n',
+        'name,x,y,u,v\na,1,2,3,4\n"b,1,,,\nc",3,4,5,6\nd,1,2,3,4\n',  # of empty cells
+        'name x y u v\na 1 2 3 4\n"b 1 2 3 4\n',
+    ],
+)
+def test_open_quotation_marks_of_few_numbers(tmp_path, text):
+    path = tmp_path / "stars.csv"
+    path.write_text(text)
+    with pytest.raises(FormatError, match=r"line 3: .*quotation mark|row 2: has 1 of 5 cells"):
+        read_table(path)
+
+
 def test_cells_with_line_breaks_are_read(tmp_path, rng):
     table = Table({name: rng.normal(size=30).round(4) for name in "xyuv"})
     table["note"] = [
