@@ -6,6 +6,7 @@ import numpy as np
 import pyarrow
 import pyarrow.parquet as pq
 import pytest
+from astropy import units
 from astropy.table import MaskedColumn, Table
 from astropy.wcs import WCS
 
@@ -96,6 +97,15 @@ def test_the_prior_may_be_given():
     assert len(read(few, epoch=EPOCH, motion_prior=5.0)) == 60
     with pytest.raises(InputError, match="motion_prior is -1"):
         read(t, epoch=EPOCH, motion_prior=-1.0)
+
+
+def test_the_prior_may_be_a_quantity():
+    t = masked(field(900)[0], third(900))
+    as_number = read(t, epoch=EPOCH, motion_prior=20.0)
+    as_quantity = read(t, epoch=EPOCH, motion_prior=0.02 * units.arcsec / units.yr)
+    np.testing.assert_allclose(as_quantity.sigma_u, as_number.sigma_u, rtol=1e-12)
+    with pytest.raises(InputError, match=r"cannot be converted to mas / yr"):
+        read(t, epoch=EPOCH, motion_prior=20 * units.arcsec)
 
 
 @pytest.mark.parametrize(

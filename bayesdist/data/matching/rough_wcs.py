@@ -114,7 +114,7 @@ def match(
     tangent_point: Direction | None = None,
     chips: Mapping[str, int] | None = None,
     not_finite: str = "refuse",
-    motion_prior: float | None = None,
+    motion_prior: Number | None = None,
 ) -> Matches:
     """Match detections with a catalogue on the sky.
 

@@ -15,7 +15,7 @@ from bayesdist.data.repeated import check_same_position
 from bayesdist.data.tables.checks import check_not_finite
 from bayesdist.data.tables.column import length_in_mm
 from bayesdist.errors import BayesdistError, InputError
-from bayesdist.utils.quantities import Direction, Epoch, Number, direction_in, year_of
+from bayesdist.utils.quantities import Direction, Epoch, Number, direction_in, value_in, year_of
 
 
 class ReadArguments(TypedDict, total=False):
@@ -31,8 +31,8 @@ class ReadArguments(TypedDict, total=False):
     chips: Mapping[str, int] | None
     not_finite: str
     same_position: str
-    plate_scale: float | None
-    motion_prior: float | None
+    plate_scale: Number | None
+    motion_prior: Number | None
 
 
 @dataclass(frozen=True)
@@ -74,11 +74,11 @@ class ReadOptions:
         Meaning of rows with the same reference position, if the table has no column `star`:
         measurements of one star, which share the error of its position, or of separate stars with
         independent errors. Catalogue positions are compared before proper motions are applied.
-    plate_scale : float, optional
+    plate_scale : float or Quantity, optional
         Arcsec per millimetre, for u and v in a length unit (of a focal plane, a mask or a
         metrology), which is stated in the file or by `unit`. Positions and errors are converted to
         arcsec.
-    motion_prior : float, optional
+    motion_prior : float or Quantity, optional
         Standard deviation on each axis, in mas per year, of the motions of stars without a measured
         one; only with sigma = 'columns'. The default is the scatter of the other stars, if there
         are at least 30; with fewer, in tables without errors of positions and motions, and with any
@@ -101,13 +101,17 @@ class ReadOptions:
     chips: Mapping[str, int] | None = None
     not_finite: str = "refuse"
     same_position: str = "one_star"
-    plate_scale: float | None = None
-    motion_prior: float | None = None
+    plate_scale: Any = None  # converted to arcsec per mm
+    motion_prior: Any = None  # converted to mas per year
 
     def __post_init__(self) -> None:
         check_sigma(self.sigma)
         check_not_finite(self.not_finite)
         check_same_position(self.same_position)
+        for key, key_unit in (("plate_scale", "arcsec / mm"), ("motion_prior", "mas / yr")):
+            if getattr(self, key) is not None:
+                value = value_in(getattr(self, key), key_unit, key, where=f"data.{key}")
+                object.__setattr__(self, key, value)
         if self.plate_scale is not None and not 0 < self.plate_scale < np.inf:
             raise InputError(
                 f"plate_scale is {self.plate_scale}",
