@@ -315,6 +315,35 @@ def test_match_gives_them_errors_unless_errors_of_the_matches_are_given(rng):
     assert wide.sigma_u[gone[wide.star]] == pytest.approx(YEARS * 0.030, rel=0.01)
 
 
+def test_match_treats_assumed_motions_of_a_catalogue_like_missing_ones_of_a_table(rng):
+    t, _ = field(900)
+    gone = third(len(t))
+    detections, wcs = seen_table(t, rng)
+    table = masked(t, gone)
+    c = catalog_from_table(table, tangent_point=POINT)
+    assert c.assumed_motion.sum() == 300
+    options = {"radius": 0.5, "wcs": wcs, "epoch": EPOCH}
+    seen = detections.copy()
+    seen["mag"] = t["phot_g_mean_mag"]
+    whole = detections.copy()
+    whole["sigma_u"] = whole["sigma_v"] = 0.001
+    without_errors = {"catalogue_columns": {"sigma_pm_ra": "", "sigma_pm_dec": ""}}
+    for rows, how in ((detections, {"sigma": 0.01}), (seen, {"sigma": "by_magnitude"}),
+                      (whole, {}), (detections, without_errors)):  # fmt: skip
+        m, expected = (bd.match(rows, stars, **options, **how) for stars in (c, table))
+        np.testing.assert_array_equal(m.star, expected.star)
+        assert len(m) > 500 and not gone[m.star].any()
+    for how in ({}, {"motion_prior": 30.0}):
+        m, expected = (bd.match(detections, stars, **options, **how) for stars in (c, table))
+        np.testing.assert_array_equal(m.star, expected.star)
+        np.testing.assert_allclose(m.sigma_u, expected.sigma_u, rtol=1e-4)
+    assert any("have no motion" in note for note in m.notes)
+    given = catalog_from_table(table, tangent_point=POINT, motion_prior=40.0)
+    m = bd.match(detections, given, **options)
+    assert m.sigma_u[gone[m.star]] == pytest.approx(YEARS * 0.040, rel=0.01)
+    assert any("300 of 900 stars of the catalogue have a motion that is not" in n for n in m.notes)
+
+
 def test_match_table_leaves_them_out(rng):
     _, gone, c = two_thirds()
     then = c.at(EPOCH)

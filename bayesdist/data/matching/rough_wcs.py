@@ -42,7 +42,7 @@ from bayesdist.data.matching.similarity import (
 )
 from bayesdist.data.reading.centroids import check_ellipses, with_variances
 from bayesdist.data.reading.columns import CENTROIDS, present_columns
-from bayesdist.data.reading.motions import with_prior_motions
+from bayesdist.data.reading.motions import NEEDED, with_prior_motions
 from bayesdist.data.reading.options import ReadOptions
 from bayesdist.data.reading.table import (
     SKY_COLUMN,
@@ -334,8 +334,8 @@ def _reference(
 ) -> _Stars:
     """Catalogue stars with the quantities that are used.
 
-    With `fill_motions`, stars without a motion get one from a prior if one can be made; otherwise
-    they are left out.
+    With `fill_motions`, stars without a motion keep the assumed one of a `ReferenceCatalog`, with
+    its error, or get one from a prior if one can be made; otherwise they are left out.
     """
     table = _catalogue_table(catalogue)
     column_names = find_columns(
@@ -354,11 +354,21 @@ def _reference(
             'catalogue_columns={"pm_ra": "", "pm_dec": ""}',
         )
     of_motions: tuple[str, ...] = ()
+    assumed = catalogue.assumed_motion if isinstance(catalogue, ReferenceCatalog) else None
+    if moving and assumed is not None:
+        if fill_motions and options.motion_prior is None and column_names.keys() >= NEEDED:
+            of_motions = (
+                f"{np.count_nonzero(assumed)} of {len(table)} stars of the catalogue have a motion "
+                "that is not measured but assumed, with its error",
+            )
+        else:
+            for key in MOTIONS[:2]:
+                table[column_names[key]][assumed] = np.nan
     if moving and fill_motions:
         filled = with_prior_motions(
             table, column_names, source=CATALOGUE, sigma_mas_yr=options.motion_prior, reject=True
         )
-        table, of_motions = filled.table, filled.notes
+        table, of_motions = filled.table, (*of_motions, *filled.notes)
     elif options.motion_prior is not None:
         raise InputError(
             "motion_prior is given, but no errors of matches include those of motions",
