@@ -24,8 +24,7 @@ def docs(page: str | None) -> None:
     if page is None:
         width = max(map(len, pages))
         for name, path in pages.items():
-            title = read_text(path).partition("\n")[0].lstrip("# ")
-            click.echo(f"{name:{width}}  {title}")
+            click.echo(f"{name:{width}}  {_title(read_text(path))}")
         return
     name = page.removesuffix(".md")
     if name not in pages:
@@ -35,6 +34,12 @@ def docs(page: str | None) -> None:
             do=f"give {near[0]!r}" if near else "list all pages with 'bayesdist docs'",
         )
     click.echo_via_pager(read_text(pages[name]))
+
+
+def _title(text: str) -> str:
+    """First heading of a page, or the title in its front matter."""
+    first = next(line for line in text.splitlines() if line.startswith(("# ", "title:")))
+    return first.removeprefix("title:").strip("#' ")
 
 
 def _pages() -> dict[str, Path]:

@@ -161,7 +161,7 @@ def coverage(run: ReportedRun) -> Plot:
     return Plot(
         panels.figure,
         "Coverage of the detector",
-        f"Number of {rows} in each cell that are no likely {false_rows}: {count(empty)} of"
+        f"Number of {rows} in each cell, without likely {false_rows}: {count(empty)} of"
         f" {count(counts.size)} cells are empty, and the median is {np.median(counts):.0f}. Where"
         f" there are no {rows}, the solution is an extrapolation of the polynomial.",
         f"Map of the number of {rows} per cell; {empty} of {counts.size} cells are empty.",
