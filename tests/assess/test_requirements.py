@@ -428,6 +428,31 @@ def test_an_error_of_unknown_cause_is_judged_by_both(exact, of_detector, of_cata
     assert doubted.verdict == "undecided" and doubt.sentence in doubted.reason
 
 
+@pytest.mark.parametrize(("of_detector", "of_catalogue"), [(0.001, 0.01), (0.01, 0.001)])
+def test_unknown_cause_and_unknown_extent_are_combined(exact, of_detector, of_catalogue):
+    """A verdict holds for each cause of one error with each treatment of another one.
+
+    The limit is met if the larger error is absent or the other one is an offset, not with both.
+    """
+    limit, grid, size = [Requirement("a", "max", 0.05)], (8, 8), 0.01
+    varying = catalogue("Gaia DR3", size)
+    other = UserTerm("structure", "systematic", of_catalogue, of_catalogue)
+    term = OfTwoCauses("structure", "systematic", of_detector, of_detector, other=other)
+    (margin,) = margins_of(exact, limit, terms=[term, varying], grid=grid)
+    small = UserTerm("structure", "systematic", 0.001, 0.001)
+    large = replace(small, sigma_u=size, sigma_v=size)
+    for terms in ([small, varying], [large, replace(varying, varies=False)]):
+        (met,) = margins_of(exact, limit, terms=terms, grid=grid)
+        assert met.verdict == "met"
+    rng = np.random.default_rng(1)
+    drawn = size * (rng.standard_normal((20_000, 1, 2)) + rng.standard_normal((20_000, 64, 2)))
+    independent = np.mean(np.linalg.norm(drawn, axis=2).max(axis=1) <= 0.05)
+    assert margin.probability_met < independent + 5 * margin.mc_error
+    assert margin.verdict == "not shown" and "varies over the field" in margin.reason
+    # only one of the two causes is met by all treatments
+    assert "detector's or the catalogue's" in margin.reason
+
+
 @pytest.mark.parametrize(("stars", "small"), [(1500, True), (20, False)])
 def test_few_stars_may_scatter_little_by_chance(stars, small):
     dof = 2 * stars - 20

@@ -207,9 +207,11 @@ def judge(
     cases = [domains_of(r, model, grid, epoch=epoch, chip=chip) for r in requirements]
     doubts = doubts_of(checks)
     tallies = _tallied(errors, requirements, cases, factors, grid, doubts, adaptive=adaptive)
-    varying = [t.rows[0].name for t in errors.terms if isinstance(t, VaryingTerm) and t.varies]
-    ways, margins = _ways(errors, grid), []
-    ambiguous = any(term.alternative for term in errors.terms if isinstance(term, AmbiguousTerm))
+    first, other = _ways(errors, grid)
+    ways, margins = (*first, *other), []
+    terms = [term for way in (*first[:1], *other[:1]) for term in way.terms]
+    names = (t.rows[0].name for t in terms if isinstance(t, VaryingTerm) and t.varies)
+    varying = list(dict.fromkeys(names))
     for r, case, factor, (by_epoch, by_way) in zip(
         requirements, cases, factors, tallies, strict=True
     ):
@@ -218,7 +220,8 @@ def judge(
             for k, way in enumerate(ways)
         ]
         worse = min(range(len(ways)), key=lambda k: extremes[k].probability_met)
-        margin = _of_extremes(extremes, extremes[worse], varying, doubts, ambiguous=ambiguous)
+        by_cause = extremes[: len(first)], extremes[len(first) :]
+        margin = _of_extremes(by_cause, extremes[worse], varying, doubts)
         if extremes[worse].verdict in ("missed", "not shown") and not doubts:
             worst_epoch = next(domain for domain in case if domain.epoch == margin.epoch)
             remedy = required_reduction(ways[worse], r, worst_epoch, factor)
@@ -227,23 +230,28 @@ def judge(
     return tuple(margins)
 
 
-def _ways(errors: DrawnErrors, grid: tuple[int, int]) -> tuple[DrawnErrors, ...]:
+def _ways(
+    errors: DrawnErrors, grid: tuple[int, int]
+) -> tuple[tuple[DrawnErrors, ...], tuple[DrawnErrors, ...]]:
     """Draws in which errors of unknown extent or cause have each of the possible ones.
 
-    If any term has an alternative cause, it has that in the last ones.
+    Returns two tuples: draws in which terms of unknown cause have the first cause, and those in
+    which they have the alternative cause.  Each has one item per treatment of the errors that may
+    vary over the field. The second tuple is empty if no term has an alternative cause.
     """
-    ways = (errors, *errors.treatments(grid))
+    first = (errors, *errors.treatments(grid))
     terms = tuple(
         (isinstance(term, AmbiguousTerm) and term.alternative) or term for term in errors.terms
     )
     if terms == errors.terms:
-        return ways
+        return first, ()
     random = generators(terms, errors.seed)
     draws = tuple(
         old if new is term else new.draw(errors.n_draws, rng)
         for old, term, new, rng in zip(errors.draws, errors.terms, terms, random, strict=True)
     )
-    return (*ways, replace(errors, terms=terms, draws=draws, further=None, _cache={}))
+    other = replace(errors, terms=terms, draws=draws, further=None, _cache={})
+    return first, (other, *other.treatments(grid))
 
 
 def _tallied(
@@ -264,7 +272,8 @@ def _tallied(
     batch, total, out = errors, 0, list[tuple[list[list[Float]], list[Tally]]]()
     undecided = list(range(len(requirements)))
     for number in count(1):
-        ways = _ways(batch, grid)
+        first, other = _ways(batch, grid)
+        ways = (*first, *other)
         wanted: dict[EvaluationDomain, set[str]] = {}
         for i in undecided:
             for domain in cases[i]:
@@ -406,34 +415,36 @@ def _chips_of(
 
 
 def _of_extremes(
-    margins: Sequence[Margin],
+    by_cause: tuple[Sequence[Margin], Sequence[Margin]],
     worse: Margin,
     names: Sequence[str],
     doubts: Sequence[Check],
-    *,
-    ambiguous: bool,
 ) -> Margin:
     """The least favourable margin, `worse`, with a verdict that is valid for all margins.
 
-    `names` are those of errors that may vary over the field.  If `ambiguous`, the last margin is
-    that with structure of the catalogue.
+    `by_cause` are margins with unmodelled structure of the detector, and with structure of the
+    catalogue; the latter are empty if the cause is known.  `names` are those of errors that may
+    vary over the field.
     """
+    margins = [m for of_cause in by_cause for m in of_cause]
     better = max(margins, key=lambda m: m.probability_met)
     if all(m.verdict == worse.verdict for m in margins) or worse.verdict == "undecided":
         return worse
-    of_one_cause = margins[:-1] if ambiguous else margins
-    if ambiguous and len({m.verdict for m in of_one_cause}) == 1:
-        reason = (
-            "it depends on whether the unmodelled structure is the detector's or the catalogue's, "
+    unknown = []
+    verdicts = [{m.verdict for m in of_cause} for of_cause in by_cause if of_cause]
+    if any(of_cause != verdicts[0] for of_cause in verdicts):
+        unknown.append(
+            "whether the unmodelled structure is the detector's or the catalogue's, "
             "which the residuals do not tell (state the catalogue's errors by [catalogue], or add "
-            "exposures that point elsewhere): "
+            "exposures that point elsewhere)"
         )
-    else:
+    if any(len(of_cause) > 1 for of_cause in verdicts):
         vary = "varies" if len(names) == 1 else "vary"
-        reason = (
-            f"it depends on how {' and '.join(names)} {vary} over the field: as one offset, a "
-            "smooth field, or independent errors, "
+        unknown.append(
+            f"how {' and '.join(names)} {vary} over the field (as one offset, a smooth field, or "
+            "independent errors)"
         )
+    reason = f"it depends on {', and on '.join(unknown)}: "
     reason += f"P(met) is {_fraction(worse)} to {_fraction(better)}"
     if doubts:
         texts = [*(check.sentence for check in doubts), reason]
