@@ -9,7 +9,9 @@ import pytest
 
 from bayesdist.assess import LocalErrors, Requirement, UserTerm, check_requirements
 from bayesdist.assess.alignment import Alignment
+from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.model import error_model
+from bayesdist.assess.terms.forms import Functions, Image, Row
 from bayesdist.assess.terms.parameters import (
     MOTIONS,
     CatalogueErrors,
@@ -320,6 +322,37 @@ def test_a_chip_of_its_own_is_aligned_with_all_of_them(solution_of):
     one, two = check_requirements(solution_of(model, theta), req, rng=rng(), **options)
     for m in (one, two):
         assert np.sqrt(np.mean(m.draws**2)) == pytest.approx(0.01, rel=5 / np.sqrt(2 * 2000))
+
+
+def test_the_alignment_is_fitted_once_for_all_domains(solution_of):
+    """It depends on the functions and the positions aligned by, not on the domain judged."""
+    model, theta = scattering(apart=True, own=(0.0,) * 6)
+    calls = []
+
+    def functions(chip, x, y):
+        calls.append(len(x))
+        return np.cos(np.outer(x + 100 * chip, [1e-3, 3e-3])) + np.outer(y, [1e-4, 0.0])
+
+    def drawn():
+        return Functions(Row("s", "local"), coefficients, functions, 50)
+
+    coefficients = {c: rng(c).normal(size=(50, 2, 2)) for c in (1, 2)}
+    domains = [
+        EvaluationDomain(model, np.full(len(X), c), X + shift, Y)
+        for c in (1, 2)
+        for shift in (0, 1)
+    ]
+    turned = theta.copy()  # an alignment by other positions
+    turned[model.coefficient_slice(1, 0)] *= 1.5
+    of_all = drawn()
+    for mean in (theta, turned):
+        calls.clear()
+        found = [of_all.on(domain, Image(None, mean)).total() for domain in domains]
+        assert sum(n != len(X) for n in calls) == len(model.chips)  # integrals over the chips
+        for domain, total in zip(domains, found, strict=True):
+            alone = drawn().on(domain, Image(None, mean)).total()
+            np.testing.assert_array_equal(total, alone)
+    assert np.abs(alone / drawn().on(domain, Image(None, theta)).total() - 1).max() > 0.01
 
 
 # -- budget and requirements ----------------------------------------------------------------------

@@ -389,11 +389,13 @@ class Functions:
     _cache: dict[tuple[EvaluationDomain, bytes], FunctionField] = field(
         default_factory=dict, repr=False
     )
+    # apart from the fields, because it is the same for all domains and takes longest
+    _absorbed: dict[tuple[int, bytes], AbsorbedPart] = field(default_factory=dict, repr=False)
 
     def on(self, domain: EvaluationDomain, image: Image) -> FunctionField:
         """Errors at the positions of a domain, without the part that an alignment absorbs.
 
-        The most recent ones are cached.
+        The most recent ones are cached, and so is the part that the alignment absorbs.
         """
         mean = image.aligned_by
         key = domain.at(None), b"" if mean is None else mean.tobytes()
@@ -404,8 +406,8 @@ class Functions:
 
     def _aligned(self, domain: EvaluationDomain, mean: Float | None) -> FunctionField:
         """Errors at the positions of a domain; `mean` are the `aligned_by` of the image."""
-        # without this cache, since a reference cycle would keep large arrays in memory
-        of = replace(self, _cache={})
+        # without the caches, since a reference cycle would keep large arrays in memory
+        of = replace(self, _cache={}, _absorbed={})
         if mean is None:
             return FunctionField((self.row,), domain, of)
         if self.uniform:  # a shift is absorbed exactly
@@ -413,9 +415,13 @@ class Functions:
             covariance = self.covariance and {k: 0.0 * c for k, c in self.covariance.items()}
             of = replace(of, coefficients=chips, covariance=covariance)
             return FunctionField((self.row,), domain, of)
-        # drifts change positions too little to matter for the rotation
-        epoch = None if domain.model.time is None else domain.model.time.epoch0[0]
-        return FunctionField((self.row,), domain, of, Alignment.of(domain.model, mean, epoch))
+        key = id(domain.model), mean.tobytes()  # the cached part keeps the model alive
+        if key not in self._absorbed:
+            self._absorbed.clear()
+            # drifts change positions too little to matter for the rotation
+            epoch = None if domain.model.time is None else domain.model.time.epoch0[0]
+            self._absorbed[key] = AbsorbedPart(of, Alignment.of(domain.model, mean, epoch))
+        return FunctionField((self.row,), domain, of, self._absorbed[key])
 
     def of(self, chip: int) -> NDArray[np.floating] | None:
         """Coefficients (n', 2, m) on a chip; None if there is no error."""
@@ -433,11 +439,39 @@ class Functions:
 
 
 @dataclass(frozen=True, eq=False)
+class AbsorbedPart:
+    """Shift and rotation of the whole detector that an alignment fits to sums of functions."""
+
+    of: Functions
+    alignment: Alignment
+
+    @cached_property
+    def by_function(self) -> dict[int, Float]:
+        """Shifts and rotation (3, 2, m) fitted to each function, by number of chips with errors."""
+        chips = (chip.number for chip in self.alignment.model.chips)
+        fit = partial(self.alignment.fitted, functions=self.of.functions)
+        return {chip: fit(chip) for chip in chips if self.of.of(chip) is not None}
+
+    @cached_property
+    def by_row(self) -> Float:
+        """Shifts and rotation (n', 3) fitted to the errors of each row of coefficients."""
+        by_chip = [
+            np.tensordot(required(self.of.of(chip), "the chip has errors"), fit, ((1, 2), (1, 2)))
+            for chip, fit in self.by_function.items()
+        ]
+        every = slice(0, max((len(fitted) for fitted in by_chip), default=1))
+        total = np.zeros((1, 3))
+        for fitted in by_chip:
+            total = total + _of_draws(fitted, every)
+        return total
+
+
+@dataclass(frozen=True, eq=False)
 class FunctionField(DrawnField):
     """Sums of functions at the positions of a domain."""
 
     of: Functions
-    alignment: Alignment | None = None  # the shift and rotation that it fits are subtracted
+    absorbed: AbsorbedPart | None = None  # shift and rotation that are subtracted
 
     @property
     def n_draws(self) -> int:
@@ -475,43 +509,18 @@ class FunctionField(DrawnField):
             drawn = _of_draws(values, draws)
             parts.append(drawn if phi is None else np.swapaxes(drawn @ phi.T, 1, 2))
         out = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
-        if self.alignment is not None:
-            absorbed = _of_draws(self._absorbed, draws) @ self._rigid.reshape(-1, 3).T
+        if self.absorbed is not None:
+            absorbed = _of_draws(self.absorbed.by_row, draws) @ self._rigid.reshape(-1, 3).T
             out = out - absorbed.reshape(len(absorbed), -1, 2)
         size = scale.get(self.of.row.name, 1.0)
         return np.asarray(out if size == 1.0 else size * out, float)
 
     @cached_property
-    def _fits(self) -> dict[int, Float]:
-        """Shifts and rotation (3, 2, m) fitted to each function, by number of a chip with errors.
-
-        Empty without an alignment.
-        """
-        if self.alignment is None:
-            return {}
-        chips = (chip.number for chip in self.domain.model.chips)
-        fit = partial(self.alignment.fitted, functions=self.of.functions)
-        return {chip: fit(chip) for chip in chips if self.of.of(chip) is not None}
-
-    @cached_property
-    def _absorbed(self) -> Float:
-        """Shifts and rotation (n', 3) fitted to the errors of each row of coefficients."""
-        by_chip = [
-            np.tensordot(required(self.of.of(chip), "the chip has errors"), fit, ((1, 2), (1, 2)))
-            for chip, fit in self._fits.items()
-        ]
-        every = slice(0, max((len(fitted) for fitted in by_chip), default=1))
-        total = np.zeros((1, 3))
-        for fitted in by_chip:
-            total = total + _of_draws(fitted, every)
-        return total
-
-    @cached_property
     def _rigid(self) -> Float:
         """Both shifts and the rotation (N, 2, 3) at the positions of the domain."""
-        at, alignment = self.domain, required(self.alignment, "there is no alignment")
+        at, absorbed = self.domain, required(self.absorbed, "there is no alignment")
         return np.concatenate(
-            [alignment.at(chip, at.x[rows], at.y[rows]) for chip, rows in at.by_chip()]
+            [absorbed.alignment.at(chip, at.x[rows], at.y[rows]) for chip, rows in at.by_chip()]
         )
 
     def total(self) -> Float:
@@ -534,7 +543,7 @@ class FunctionField(DrawnField):
             axis=1,
         )
         crossed = np.zeros(0)
-        if self.alignment is not None:
+        if self.absorbed is not None:
             functions, crossed = self._without_rigid(functions, root)
         squares = np.square(functions).sum(axis=2).T
         if pairs is None:
@@ -542,7 +551,7 @@ class FunctionField(DrawnField):
         first, second = pairs
         out = squares[first] + squares[second]  # of chips whose coefficients are independent
         alike = (at.chip[first] == at.chip[second]) | (None in covariance)
-        if self.alignment is not None:  # the shift and rotation of both chips are common
+        if self.absorbed is not None:  # the shift and rotation of both chips are common
             apart = np.flatnonzero(~alike)
             to_first, to_second = (
                 np.einsum("nap,nap->na", self._rigid[i[apart]], crossed[j[apart]])
@@ -565,7 +574,8 @@ class FunctionField(DrawnField):
         `root` has the matrices that `_roots` returns.
         """
         out: dict[int | None, Float] = {}
-        for chip, fit in self._fits.items():
+        absorbed = required(self.absorbed, "there is no alignment")
+        for chip, fit in absorbed.by_function.items():
             key = chip if chip in root else None
             out[key] = out.get(key, 0.0) + np.einsum("pam,amk->apk", fit, root[key])
         return out
@@ -606,8 +616,10 @@ class FunctionField(DrawnField):
         size = model.chips[model.chip_code(chip)].size
         x, y = mesh(*grid_pixels(size, DEFAULT_GRID))
         values = self.of.values(chip, x, y)
-        if self.alignment is not None:
-            absorbed = self._absorbed @ self.alignment.at(chip, x, y).reshape(-1, 3).T
+        if self.absorbed is not None:
+            absorbed = (
+                self.absorbed.by_row @ self.absorbed.alignment.at(chip, x, y).reshape(-1, 3).T
+            )
             values = values - absorbed.reshape(len(absorbed), -1, 2)
         by_draw = np.sqrt(np.mean(np.square(values, dtype=float), axis=(1, 2)))
         mean = float(by_draw.mean())

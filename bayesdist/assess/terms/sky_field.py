@@ -230,5 +230,6 @@ class GrowingFunctions:
                 coefficients={k: years * c for k, c in of.coefficients.items()},
                 covariance={k: years**2 * c for k, c in (of.covariance or {}).items()},
                 _cache={},
+                _absorbed={},
             )
         return self._cache[years].on(domain, image)
