@@ -14,7 +14,7 @@ import bayesdist as bd
 from bayesdist.app.config import parse_config
 from bayesdist.app.kinds.plausibility import doubts_on_stars, refuse_empty_segments
 from bayesdist.data import Matches, read_matches, write_partitioned
-from bayesdist.errors import ConfigError, InputError
+from bayesdist.errors import ConfigError, DegenerateError, InputError
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 
 from .support import cli, write_job
@@ -447,3 +447,18 @@ def test_settings_that_cannot_be_meant(settings, words):
         config(**settings)
     assert words in str(caught.value) and "c.toml" in str(caught.value)
     assert len(str(caught.value)) < 300
+
+
+@pytest.mark.parametrize("way", [(10, 0), (7, 7)])
+def test_displaced_stars_are_named_if_they_leave_the_jitter_open(way):
+    """A fifth of the stars, ten errors from the others, in whichever direction."""
+    rng, n, sigma = np.random.default_rng(5), 900, 0.02
+    x, y = rng.uniform(1, 2048, (2, n))
+    hit = rng.uniform(size=n) < 0.2
+    u, v = (at + sigma * (rng.normal(size=n) + d * hit) for at, d in zip((x, y), way, strict=True))
+    stars = bd.Matches.from_table(dict(x=x, y=y, u=u, v=v), sigma=sigma, unit="pix")
+    with pytest.raises(DegenerateError, match="do not bound the additional scatter") as raised:
+        bd.calibrate(stars, order=3, size=(2048, 2048))
+    message = str(raised.value)
+    assert "a likely cause is that" in message and "displaced from the others" in message
+    assert "give the exposure of each star" in message and "check the unit" not in message

@@ -90,9 +90,15 @@ class ChipResiduals:
         """Scatter per axis, from the median of the squares; weighted by `inlier` if asked for."""
         return _scatter(self.z, self.inlier if weighted else None)
 
+    def without_polynomials(self, order: int) -> ChipResiduals:
+        """Residuals minus a robust fit of polynomials up to `order`."""
+        z = _minus_fit(legendre_products(self.X, self.Y, polynomial_terms(order)), self.z)
+        return replace(self, z=z, free=1.0 - n_terms(order) / self.n_stars)
+
     def without_terms(self, order: int) -> ChipResiduals:
         """Residuals minus polynomials up to `order` and low-order terms of each exposure."""
-        z = _minus_fit(legendre_products(self.X, self.Y, polynomial_terms(order)), self.z)
+        rest = self.without_polynomials(order)
+        z = rest.z
         codes, of = np.unique(self.exposure, return_inverse=True)
         if len(codes) > 1:
             z = z.copy()
@@ -102,7 +108,7 @@ class ChipResiduals:
                 if low:
                     F = legendre_products(self.X[at], self.Y[at], polynomial_terms(low[0]))
                     z[:, at] = _minus_fit(F, z[:, at])
-        return replace(self, z=z, free=1.0 - n_terms(order) / self.n_stars)
+        return replace(rest, z=z)
 
     def in_units_of_scatter(self) -> ChipResiduals:
         """Residuals divided by their scatter, with errors that are larger by the same factor."""

@@ -144,7 +144,9 @@ def _symmetric_chips(
         if order == chip.order or _lacks_more_than(chip, order):
             continue
         part = chip.without_terms(order)
-        if chip.scatter() > MOST_MISSING * part.scatter():
+        # Displaced stars move the solution itself away from the core of the residuals: only terms
+        # beyond its own are missing.
+        if chip.without_polynomials(chip.order).scatter() > MOST_MISSING * part.scatter():
             continue
         part = part.in_units_of_scatter()
         if free is not None:

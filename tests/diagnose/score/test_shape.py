@@ -255,3 +255,20 @@ def test_noise_is_held_only_where_the_residuals_are_symmetric():
     [check] = score_checks(list(found.values()), correlated)
     assert "Noise" in check.name or "noise" in check.name
     assert not check.doubt and "errors that depend on position" in check.sentence
+
+
+@pytest.mark.parametrize("share", [0.15, 0.2])
+@pytest.mark.parametrize("angle", [0, 45])
+def test_stars_that_moved_the_least_squares_solution_are_found(share, angle):
+    """Displaced by ten errors they move the solution by more than the scatter of the others."""
+    way = np.array([np.cos(np.radians(angle)), np.sin(np.radians(angle))])
+
+    def displaced(rng, x, y):
+        return (rng.uniform(size=len(x)) < share)[:, None] * 10 * SIGMA * way
+
+    for seed in range(5):
+        table = scene(np.random.default_rng([47, seed]), 900, displaced, false=0.0)
+        fit = fit_linear(table, model_of(3), rejection=Rejection(np.inf, None))
+        found = {test.name: test for test in score_tests(table, fit)}
+        assert found["displaced stars"].significant
+        assert "a match radius" not in found["displaced stars"].finding

@@ -10,6 +10,7 @@ from bayesdist.app.artefacts.stars import in_circle
 from bayesdist.app.assessment.error_terms import idle_dates
 from bayesdist.app.config import load_config
 from bayesdist.app.kinds.plausibility import doubts_on_stars
+from bayesdist.app.kinds.sampling import naming_displaced_stars
 from bayesdist.app.rehearsal import rehearse
 from bayesdist.app.run import Run
 from bayesdist.app.screen import number
@@ -107,17 +108,18 @@ def _cost(run: Run) -> str:
     if dear * n > MOST_STARS or n_params > MOST_PARAMS:
         provided = " if the posterior is close to normal, which was not examined"
     else:
-        trial = predict_sampling(
-            run.fit,
-            run.shards,
-            outliers=mixture,
-            priors=run.priors,
-            seed=sampler.seed,
-            ensembles=sampler.ensembles,
-            walkers=sampler.walkers,
-            limits=limits,
-            max_steps=sampler.max_steps,
-        )
+        with naming_displaced_stars(run):
+            trial = predict_sampling(
+                run.fit,
+                run.shards,
+                outliers=mixture,
+                priors=run.priors,
+                seed=sampler.seed,
+                ensembles=sampler.ensembles,
+                walkers=sampler.walkers,
+                limits=limits,
+                max_steps=sampler.max_steps,
+            )
         if trial.passes is None:
             longest = number(search + trial.most_passes * (per_pass + OVERHEAD_S), 2)
             return (
