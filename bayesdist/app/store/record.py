@@ -91,6 +91,18 @@ def _as_sections(raw: dict[str, Any]) -> dict[str, Any]:
     return raw
 
 
+class _Ingredients(BaseModel):
+    """Ingredients of a stage that are read again; settings are only compared."""
+
+    from_: dict[str, str] = Field(default_factory=dict, alias="from")
+
+
+def _as_ingredients(raw: dict[str, Any]) -> dict[str, Any]:
+    """Validate the ingredients of a stage and return them unchanged."""
+    _Ingredients.model_validate(raw)
+    return raw
+
+
 class Artefact(_Part):
     """Ingredients of a stage, and the files that it wrote.
 
@@ -107,7 +119,7 @@ class Artefact(_Part):
     """
 
     key: str
-    parts: dict[str, Any]
+    parts: Annotated[dict[str, Any], AfterValidator(_as_ingredients)]
     files: dict[str, FileMark]
     sections: Annotated[dict[str, Any], AfterValidator(_as_sections)]
 
