@@ -498,7 +498,8 @@ def catalog_from_table(
     motion_prior : float, optional
         Standard deviation on each axis, in mas per year, of the motions of stars without a measured
         one. The default is the scatter of the other stars, if there are at least 30; with fewer,
-        and without errors of positions and motions, such stars are left out.
+        and without errors of positions and motions, such stars are left out. With fewer than 30,
+        the error of the median of the others is added in quadrature.
 
     Returns
     -------
@@ -508,8 +509,9 @@ def catalog_from_table(
     Raises
     ------
     InputError
-        If columns are missing, if values are missing or not numbers, or if units are missing or
-        contradictory.
+        If columns are missing, if values are missing or not numbers, if units are missing or
+        contradictory, or if `motion_prior` is not positive or given without errors of positions and
+        motions.
     """
     if epoch is not None:
         epoch = year_of(epoch, where=source)

@@ -76,6 +76,10 @@ PathLike = str | os.PathLike[str]
 Segment = tuple[int, int, int]  # file, first row, and row after the last
 BLOCK = 2**16  # rows read together
 STARS_OF_PRIOR = 200_000  # from which a prior of motions is made
+NO_COVARIANCE = (
+    "error ellipses are not converted in tables on disk, so that errors of x and y are taken as "
+    "uncorrelated"
+)
 Labelled = tuple[Int, tuple[str, ...]]
 # columns, their units, and header values that no column holds
 Part = tuple[Mapping[str, NDArray[Any] | Labelled], Mapping[str, str], Mapping[str, Any]]
@@ -387,11 +391,21 @@ def stored_file(
     column_names, options, notes = columns_read(part.colnames, {}, options, source=source)
     are_moved(options, column_names, source)  # refuses options that would have no effect
     ellipse = ellipse_columns(part.colnames)
-    if options.read_sigma and "sigma_u" not in column_names and ellipse is not None:
+    named = options.columns or {}
+    if "sigma_x" in column_names and "rho_xy" not in column_names and ellipse is not None:
+        notes = (*notes, *(() if named.get("rho_xy") == "" else (NO_COVARIANCE,)))
+    used = options.read_sigma and not {"sigma_u", "sigma_x"} & column_names.keys()
+    if used and ellipse is not None and named.get("sigma_x") != "":
         raise InputError(
             f"error ellipses ({', '.join(ellipse[0])}) are not converted in tables on disk",
             where=source,
             do=f"write the variances as {', '.join(ellipse[1])}, or set data.sigma to a number",
+        )
+    if named.get("flux"):
+        raise InputError(
+            f"column {named['flux']!r} is named for 'flux', which is not read in tables on disk",
+            where=f"{source}, columns",
+            do="leave 'flux' out, and write magnitudes into the table if they are needed",
         )
     column_names.pop("flux", None)  # magnitudes would require the fluxes of all rows to be positive
     refuse_half(("sigma_u", "sigma_v"), column_names, where=source, what="errors")
@@ -417,12 +431,14 @@ def _with_motion_prior(files: Sequence[StoredFile], sigma_mas_yr: float | None) 
     """
     step = max(1, sum(file.part.n_rows for file in files) // STARS_OF_PRIOR)
     samples = list[dict[str, Float]]()
+    magnitudes: list[list[Float]] = [[] for _ in files]  # of stars without a motion
     missing, zero, doubtful = (np.zeros(len(files), int) for _ in range(3))
     for k, file in enumerate(files):
         for first, stars in file.moving_stars():
             stars.refuse_missing_errors()
             samples.append(stars.measured(slice(-first % step, None, step)))
             missing[k] += np.count_nonzero(stars.missing)
+            magnitudes[k].append(stars.magnitude[stars.missing][::step])
             zero[k], doubtful[k] = zero[k] + stars.n_zero, doubtful[k] + stars.n_doubtful
     prior = None
     if samples and missing.any():
@@ -432,7 +448,7 @@ def _with_motion_prior(files: Sequence[StoredFile], sigma_mas_yr: float | None) 
         n, notes = file.part.n_rows, [*file.notes]
         notes += doubtful_solutions(int(doubtful[k]), file.part.n_rows)
         if prior is not None and missing[k]:
-            notes.append(prior.note(int(missing[k]), n))
+            notes.append(prior.note(np.concatenate(magnitudes[k]), int(missing[k]), n))
             names = [file.found[key] for key in MOTIONS[:2]]
             warn_of_zeros(names, int(zero[k]), n, file.source)
         out.append(replace(file, motion_prior=prior, notes=tuple(notes)))

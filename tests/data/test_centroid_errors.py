@@ -191,3 +191,32 @@ def test_matches_on_a_line_do_not_say_how_large_a_pixel_is(rng):
     table["y"] = 2 * table["x"]
     with pytest.raises(InputError, match="400 matches do not determine the size of a pixel"):
         matches_from_table(table, ReadOptions(unit="arcsec"))
+
+
+def test_unused_ellipses_on_disk_are_not_refused(rng, tmp_path):
+    table = stars(rng)
+    table["ERRA_IMAGE"], table["ERRB_IMAGE"], table["ERRTHETA_IMAGE"] = 0.03, 0.02, 0.0
+    table["ERRX2_IMAGE"], table["ERRY2_IMAGE"] = 0.03**2, 0.02**2
+    table.write(tmp_path / "both.parquet")
+    disk = open_matches(tmp_path / "both.parquet", unit="arcsec")
+    here = matches_from_table(table, ReadOptions(unit="arcsec"))
+    np.testing.assert_allclose(covariances(disk.load()), covariances(here), rtol=1e-9, atol=1e-15)
+    assert any("taken as uncorrelated" in note for note in disk.notes)
+    table.remove_columns(["ERRX2_IMAGE", "ERRY2_IMAGE"])
+    without = dict.fromkeys(("sigma_x", "sigma_y", "rho_xy"), "")
+    table["ra"], table["dec"] = 150.0 + table["u"] / 3600, 2.0 + table["v"] / 3600
+    table["ra_error"], table["dec_error"] = 1.0, 1.0
+    for name, unit in (("ra", "deg"), ("dec", "deg"), ("ra_error", "mas"), ("dec_error", "mas")):
+        table[name].unit = unit
+    table.remove_columns(["u", "v"])
+    table.write(tmp_path / "ellipses.parquet")
+    stored = open_matches(tmp_path / "ellipses.parquet", columns=without).load()
+    np.testing.assert_allclose(stored.sigma_u, 0.001, rtol=1e-3)
+
+
+def test_a_named_column_of_fluxes_is_refused_on_disk(rng, tmp_path):
+    stars(rng, FLUX=np.full(N, 100.0)).write(tmp_path / "stars.parquet")
+    options = {"unit": "arcsec", "sigma": 0.01}
+    with pytest.raises(InputError, match="'FLUX' is named for 'flux', which is not read"):
+        open_matches(tmp_path / "stars.parquet", columns={"flux": "FLUX"}, **options)
+    open_matches(tmp_path / "stars.parquet", **options)

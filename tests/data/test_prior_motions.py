@@ -277,6 +277,76 @@ def test_catalogues_on_a_plane_have_them_in_their_unit(unit):
         assert given.sigma_pm_v[gone] == pytest.approx(5.0)
 
 
+@pytest.mark.parametrize("prior", [-5.0, 0.0, np.nan, np.inf])
+def test_catalogues_refuse_a_prior_that_is_not_positive(prior):
+    with pytest.raises(InputError, match=f"motion_prior is {prior}"):
+        two_thirds(motion_prior=prior)
+
+
+@pytest.mark.parametrize("key", ["sigma_pm_ra", "pm_ra", "sigma_ra"])
+def test_a_prior_without_effect_is_refused_in_catalogues_and_match(key, rng):
+    t, gone, _ = two_thirds()
+    without = {key: "", key.replace("ra", "dec"): ""}
+    reason = f"motion_prior is given, .* read for '{key}'"
+    with pytest.raises(InputError, match=reason):
+        catalog_from_table(masked(t, gone), without, motion_prior=5.0)
+    detections, wcs = seen_table(t, rng)
+    options = {"radius": 0.5, "wcs": wcs, "epoch": EPOCH, "catalogue_columns": without}
+    with pytest.raises(InputError, match="motion_prior is given"):
+        bd.match(detections, masked(t, gone), **options, motion_prior=5.0)
+    plane = Table({"u": [0.0, 1.0], "v": [0.0, 1.0], "sigma_u": [1.0, 1], "sigma_v": [1.0, 1]})
+    with pytest.raises(InputError, match="read for 'pm_u'"):
+        catalog_from_table(plane, unit="mas", motion_prior=5.0)
+
+
+@pytest.mark.parametrize("n", [1, 3, 10])
+def test_a_given_prior_includes_the_error_of_the_median_of_few_stars(n):
+    """Stars of one common motion with the scatter that is given: standard scores have variance 1.
+
+    The common motion is uniform within +- 60 mas/yr.
+    """
+    z = []
+    for seed in range(200):
+        rng = np.random.default_rng([n, seed])
+        true = rng.uniform(-60, 60, 2)[:, None] + 5.0 * rng.normal(size=(2, n + 1))
+        t = Table({"u": np.arange(n + 1.0), "v": np.zeros(n + 1)})
+        t["sigma_u"] = t["sigma_v"] = np.full(n + 1, 0.3)
+        for k, axis in enumerate("uv"):
+            t[f"pm_{axis}"] = np.append(true[k, :n], np.nan)
+            t[f"sigma_pm_{axis}"] = np.append(np.full(n, 0.01), np.nan)
+        c = catalog_from_table(t, unit="mas", epoch=2016.0, motion_prior=5.0)
+        z += [
+            (c.pm_u[n] - true[0, n]) / c.sigma_pm_u[n],
+            (c.pm_v[n] - true[1, n]) / c.sigma_pm_v[n],
+        ]
+    # of 400 normal scores with an error of the variance of 0.07; larger errors are allowed for few
+    assert 0.6 < np.mean(np.square(z)) < 1.2
+    assert f"the median of the {n} measured motions" in c.notes[0]
+
+
+@pytest.mark.parametrize("n", [1, 3, 20])
+def test_few_parallaxes_do_not_give_those_of_the_others(n):
+    t, _ = field(900)
+    gone = np.arange(900) >= n
+    t["parallax"] = 10.0
+    c = catalog_from_table(masked(t, gone), tangent_point=POINT, motion_prior=5.0)
+    assert np.all(c.parallax[gone] == 0) and c.sigma_parallax[gone].min() >= 0.010
+
+
+def test_the_note_states_the_median_error_of_the_stars_that_get_it(tmp_path):
+    t, faint = field(3000)
+    gone = faint & (np.arange(3000) % 2 == 0)  # with a scatter of 2 mas/yr, that of all is larger
+    expected = np.median(np.asarray(catalog_from_table(masked(t, gone)).sigma_pm_u)[gone]) * 1e3
+    pq.write_table(
+        pyarrow.Table.from_pandas(masked(t, gone).to_pandas()), tmp_path / "stars.parquet"
+    )
+    disk = bd.open_matches(tmp_path / "stars.parquet", epoch=EPOCH, tangent_point=POINT)
+    for notes in (catalog_from_table(masked(t, gone)).notes, disk.notes):
+        note = next(note for note in notes if "no motion" in note)
+        stated = float(note.split("median error of ")[1].split()[0])
+        assert stated == pytest.approx(expected, rel=0.05) and stated < 3.0
+
+
 def test_reliable_motions_are_selected_among_the_measured_ones():
     c = two_thirds()[2]
     line = motion_error_line(c)

@@ -11,8 +11,9 @@ import numpy as np
 
 from bayesdist.data.covariances import LARGEST_RHO
 from bayesdist.data.reading.centroids import with_centroid_errors
+from bayesdist.data.reading.motions import refuse_unused_prior
 from bayesdist.data.reading.options import ReadOptions
-from bayesdist.data.sky import MOTIONS, SKY_QUANTITIES, onto_plane, reference_sky
+from bayesdist.data.sky import SKY_QUANTITIES, onto_plane, reference_sky
 from bayesdist.data.tables.checks import refuse_half
 from bayesdist.data.tables.column import EncodedColumn, Quantities, SourceColumn, check_unit
 from bayesdist.data.tables.names import ALIASES, PAIRS, find_columns, origin_of
@@ -197,15 +198,7 @@ def _refuse_unused(options: ReadOptions, found: Mapping[str, str], source: str) 
 def _refuse_unread(options: ReadOptions, found: Mapping[str, str], source: str) -> None:
     """Raise InputError for named columns, and a prior of motions, that would not be read."""
     by_sigma = "" if options.read_sigma else f"data.sigma is {options.sigma!r}"
-    if options.motion_prior is not None:
-        lacking = [key for key in (*MOTIONS, "sigma_ra", "sigma_dec") if key not in found]
-        if lacking:
-            raise InputError(
-                "motion_prior is given, and errors of positions do not grow with it: no column is "
-                f"read for {lacking[0]!r}",
-                where=f"{source}, data.motion_prior",
-                do="leave it out, or read the errors of positions and motions from columns",
-            )
+    refuse_unused_prior(options.motion_prior, found, where=f"{source}, data.motion_prior")
     unread = [key for key, name in (options.columns or {}).items() if name and key not in found]
     if not unread:
         return

@@ -26,6 +26,7 @@ log = logging.getLogger("bayesdist")
 MIN_STARS = 30  # with a measured motion, from which a prior is made
 PER_BIN = 60  # stars of a bin of magnitudes
 MOST_BINS = 5
+MEDIAN_TO_MEAN = (np.pi / 2.0) ** 0.5  # error of the median of normal values, in errors of the mean
 TWO_PARAMETERS = 3  # astrometric_params_solved of Gaia's solutions of the position alone
 DOUBTFUL_RUWE = 1.4  # above it Gaia's documentation doubts that a star is single
 SOLVED, G_MAGNITUDE, RUWE = "astrometric_params_solved", "phot_g_mean_mag", "ruwe"
@@ -91,9 +92,10 @@ def with_prior_motions(
     Raises
     ------
     InputError
-        If a star with a motion has no error of it, or if a prior is given and the unit of positions
-        is no angle.
+        If a star with a motion has no error of it, if a prior is given and the unit of positions is
+        no angle, or as for `refuse_unused_prior`.
     """
+    refuse_unused_prior(sigma_mas_yr, found, where=source, on_plane=unit is not None)
     unchanged = Filled(table, np.zeros(len(table), bool))
     if not found.keys() >= NEEDED:
         return unchanged
@@ -110,8 +112,36 @@ def with_prior_motions(
     out = table.copy(copy_data=False)
     for name, column in prior.columns(stars).items():
         out[name] = column
-    note = prior.note(int(stars.missing.sum()), len(table))
+    magnitude = stars.magnitude[stars.missing]
+    note = prior.note(magnitude, len(magnitude), len(table))
     return Filled(out, stars.missing, (*notes, note))
+
+
+def refuse_unused_prior(
+    sigma_mas_yr: float | None, found: Mapping[str, str], *, where: str, on_plane: bool = False
+) -> None:
+    """Raise InputError if a prior of motions is given that is not positive, or has no effect.
+
+    `found` are the columns by quantity.  `on_plane` is True for positions u, v.
+    """
+    if sigma_mas_yr is None:
+        return
+    if not 0 < sigma_mas_yr < np.inf:
+        raise InputError(
+            f"motion_prior is {sigma_mas_yr}",
+            where=where,
+            do="give a positive number of mas per year",
+        )
+    lacking = [key for key in (*MOTIONS, "sigma_ra", "sigma_dec") if key not in found]
+    if lacking:
+        if on_plane:
+            lacking = [key.replace("_ra", "_u").replace("_dec", "_v") for key in lacking]
+        raise InputError(
+            "motion_prior is given, and errors of positions do not grow with it: no column is "
+            f"read for {lacking[0]!r}",
+            where=where,
+            do="leave it out, or read the errors of positions and motions from columns",
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,14 +220,11 @@ class MotionPrior:
     ----------
     distributions : mapping of str to Distribution
         Distribution of each quantity in the unit of positions (per year).
-    sigma : float or None
-        Standard deviation of motions that replaces those of the distributions.
     unit : str or None
         As for `with_prior_motions`.
     """
 
     distributions: Mapping[str, Distribution]
-    sigma: float | None
     unit: str | None
 
     @property
@@ -225,23 +252,24 @@ class MotionPrior:
                 where=source,
                 do="give positions in an angle, or leave motion_prior out",
             )
+        sigma = None if sigma_mas_yr is None or mas is None else sigma_mas_yr / mas
         distributions = {}
         for key in FILLED:
             if all(key in part for part in parts):
                 values, magnitude = np.concatenate([part[key] for part in parts], axis=1)
-                distributions[key] = Distribution.of(values, magnitude)
-                if key in MOTIONS and len(values) < MIN_STARS and sigma_mas_yr is None:
+                if key not in MOTIONS:
+                    distributions[key] = Distribution.of(values, magnitude)
+                elif len(values) >= MIN_STARS or sigma is not None:
+                    distributions[key] = Distribution.of(values, magnitude, sigma)
+                else:
                     return None
-        sigma = None if sigma_mas_yr is None or mas is None else sigma_mas_yr / mas
-        return cls(distributions, sigma, unit)
+        return cls(distributions, unit)
 
     def columns(self, stars: MovingStars) -> dict[str, Column]:
         """Columns by name in which stars without a motion have that of the prior."""
         quantities, missing, out = stars.quantities, stars.missing, dict[str, Column]()
         for key, distribution in self.distributions.items():
             mean, sigma = distribution.at(stars.magnitude[missing])
-            if key in MOTIONS and self.sigma is not None:
-                sigma = np.full(len(sigma), self.sigma)
             pairs = zip((key, f"sigma_{key}"), stars.factors[key], (mean, sigma), strict=True)
             for name, factor, filling in pairs:
                 column = quantities[name]
@@ -263,17 +291,28 @@ class MotionPrior:
             return quantities
         return replace(quantities, table=_Replaced(quantities.table, self.columns(stars)))
 
-    def note(self, n_missing: int, n: int) -> str:
-        """Clause about the stars that have a motion from the prior."""
-        size, unit = self.sigma, self.unit or ON_SKY
-        if size is None:
-            first, second = (self.distributions[key].sigma for key in MOTIONS[:2])
-            size = float(np.hypot(first, second)) / 2**0.5
-        if self.mas is not None:
-            size, unit = size * self.mas, "mas"
+    def note(self, magnitude: Float, n_missing: int, n: int) -> str:
+        """Clause about the `n_missing` of `n` stars that have a motion from the prior.
+
+        `magnitude` are the magnitudes of these stars, or of a part of them.
+        """
+        axes = [self.distributions[key] for key in MOTIONS[:2]]
+        factor, unit = (1.0, self.unit) if self.mas is None else (self.mas, "mas")
+        size = (
+            factor * float(np.median(np.hypot(*(axis.at(magnitude)[1] for axis in axes)))) / 2**0.5
+        )
+        motion = "that of the others of similar magnitude"
+        n_measured = min(axis.n for axis in axes)
+        if n_measured < MIN_STARS:
+            first, second = (factor * axis.mean for axis in axes)
+            motion = f"{first:.3g} and {second:.3g} {unit}/yr to the east and north"
+            if self.unit is not None:
+                motion = f"{first:.3g} and {second:.3g} {unit}/yr along u and v"
+            motion += f", the median of the {n_measured} measured motions"
+            motion += " (0 without any)" if not n_measured else ""
         return (
-            f"{n_missing} of {n} rows have no motion; they were given that of the others of "
-            f"similar magnitude, with an error of {size:.3g} {unit}/yr on an axis"
+            f"{n_missing} of {n} rows have no motion; they were given {motion}, with a median "
+            f"error of {size:.3g} {unit}/yr on an axis"
         )
 
 
@@ -305,22 +344,39 @@ class Distribution:
     magnitude: Float  # (B,), median of each bin
     means: Float  # (B,)
     sigmas: Float  # (B,)
+    n: int  # number of measured values
 
     @classmethod
-    def of(cls, values: Float, magnitude: Float) -> Distribution:
-        """Distribution of measured values (M,) with magnitudes (M,), NaN if unknown."""
-        none = np.zeros(0)
-        if not len(values):
-            return cls(0.0, 0.0, none, none, none)
+    def of(cls, values: Float, magnitude: Float, sigma: float | None = None) -> Distribution:
+        """Distribution of measured values (M,) with magnitudes (M,), NaN if unknown.
+
+        `sigma` replaces the standard deviations.  With fewer than `MIN_STARS` values, the error of
+        their median is added to it.  Without it, the mean is then 0 and the standard deviation
+        covers the root mean square of the values, because so few do not determine their scatter.
+        """
+        none, n = np.zeros(0), len(values)
+        if not n:
+            return cls(0.0, sigma or 0.0, none, none, none, n)
+        if n < MIN_STARS and sigma is None:
+            size = float(np.sqrt(np.mean(values**2) * (1.0 + 1.0 / n)))
+            return cls(0.0, size, none, none, none, n)
+        if n < MIN_STARS and sigma is not None:
+            scatter = max(sigma, float(np.std(values, ddof=1)) if n > 1 else 0.0)
+            size = float(np.hypot(sigma, MEDIAN_TO_MEAN * scatter / np.sqrt(n)))
+            return cls(float(np.median(values)), size, none, none, none, n)
+        spread = _normal(values)
+        overall = (spread[0], spread[1] if sigma is None else sigma)
         known = np.flatnonzero(np.isfinite(magnitude))
         n_bins = min(MOST_BINS, len(known) // PER_BIN)
         if n_bins < 2:
-            return cls(*_normal(values), none, none, none)
+            return cls(*overall, none, none, none, n)
         order = known[np.argsort(magnitude[known], kind="stable")]
         bins = np.array_split(order, n_bins)
         centres = np.array([np.median(magnitude[rows]) for rows in bins])
         means, sigmas = np.array([_normal(values[rows]) for rows in bins]).T
-        return cls(*_normal(values), centres, means, sigmas)
+        if sigma is not None:
+            sigmas = np.full(n_bins, sigma)
+        return cls(*overall, centres, means, sigmas, n)
 
     def at(self, magnitude: Float) -> tuple[Float, Float]:
         """Means and standard deviations (n,) for stars of these magnitudes (n,)."""
