@@ -37,7 +37,7 @@ from bayesdist.data.tables.names import ALIASES, find_columns
 from bayesdist.errors import InputError
 from bayesdist.files.tables import read_table
 from bayesdist.utils.arrays import Bool, Float, Int
-from bayesdist.utils.quantities import Direction, Epoch, direction_in, year_of
+from bayesdist.utils.quantities import Direction, Epoch, Number, direction_in, value_in, year_of
 
 _PAIRS = (("sigma_u", "sigma_v"), ("pm_u", "pm_v"), ("sigma_pm_u", "sigma_pm_v"))
 _PARALLAX = ("parallax", "sigma_parallax")
@@ -422,7 +422,7 @@ def read_catalog(
     unit: str | None = None,
     epoch: Epoch | None = None,
     tangent_point: Direction | None = None,
-    motion_prior: float | None = None,
+    motion_prior: Number | None = None,
 ) -> ReferenceCatalog:
     r"""Read a reference catalogue from a table file.
 
@@ -470,7 +470,7 @@ def catalog_from_table(
     unit: str | None = None,
     epoch: Epoch | None = None,
     tangent_point: Direction | None = None,
-    motion_prior: float | None = None,
+    motion_prior: Number | None = None,
 ) -> ReferenceCatalog:
     """Reference catalogue from the columns of a table.
 
@@ -495,11 +495,11 @@ def catalog_from_table(
         Epoch of the positions, if the table has no such column.
     tangent_point : SkyCoord, or pair of float or Quantity, optional
         Tangent point. The default is the mean direction of the stars.
-    motion_prior : float, optional
-        Standard deviation on each axis, in mas per year, of the motions of stars without a measured
-        one. The default is the scatter of the other stars, if there are at least 30; with fewer,
-        and without errors of positions and motions, such stars are left out. With fewer than 30,
-        the error of the median of the others is added in quadrature.
+    motion_prior : float or Quantity, optional
+        Standard deviation on each axis of the motions of stars without a measured one, in mas per
+        year if it is a number. The default is the scatter of the other stars, if there are at least
+        30; with fewer, and without errors of positions and motions, such stars are left out. With
+        fewer than 30, the error of the median of the others is added in quadrature.
 
     Returns
     -------
@@ -515,6 +515,8 @@ def catalog_from_table(
     """
     if epoch is not None:
         epoch = year_of(epoch, where=source)
+    if motion_prior is not None:
+        motion_prior = value_in(motion_prior, "mas / yr", "motion_prior", where=source)
     point = None
     if tangent_point is not None:
         point = direction_in(tangent_point, "tangent_point", where=source)

@@ -7,6 +7,7 @@ import pyarrow
 import pyarrow.parquet as pq
 import pytest
 from astropy import units
+from astropy import units as u
 from astropy.table import MaskedColumn, Table
 from astropy.wcs import WCS
 
@@ -235,7 +236,7 @@ def test_catalogues_have_the_motions_and_errors_of_tables_of_matches():
     growing = [np.median(c.at(2016.0 + dt).sigma_u[gone]) for dt in years]
     sizes = np.median(c.sigma_pm_u[gone]) * years
     np.testing.assert_allclose(growing, np.hypot(0.05e-3, sizes), rtol=0.3)
-    given = two_thirds(motion_prior=40.0)[2]
+    given = two_thirds(motion_prior=0.040 * u.arcsec / u.yr)[2]
     np.testing.assert_allclose(given.sigma_pm_u[gone], 0.040, rtol=1e-5)  # of a tangent plane
     few = catalog_from_table(masked(t, np.arange(900) >= 10), tangent_point=POINT)
     assert len(few) == 10 and few.assumed_motion is None
