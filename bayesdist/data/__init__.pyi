@@ -44,6 +44,7 @@ from .preparing import (
     motion_error_line as motion_error_line,
     neutralise_aberration as neutralise_aberration,
     select_motions as select_motions,
+    with_measured_motions as with_measured_motions,
 )
 from .read import read_matches as read_matches
 from .reading.options import ReadOptions as ReadOptions

@@ -32,6 +32,7 @@ _MAX_BINS = 40
 _MAX_SCATTERS_ABOVE = 2.5
 # smallest scatter of ln(sigma): keeps slightly larger errors if all are nearly equal
 _MIN_SCATTER = 0.05
+_MIN_STARS_OF_EXPOSURE = 10  # three determine a linear part and leave no residuals
 Bits = NDArray[np.uint64]
 HELD_OUT = "held out"  # reason under which held-out rows are counted
 
@@ -129,6 +130,45 @@ def _motion_errors(catalog: ReferenceCatalog) -> Float:
             do="give sigma_pm_u and sigma_pm_v",
         )
     return np.maximum(catalog.sigma_pm_u, catalog.sigma_pm_v)
+
+
+def with_measured_motions(table: Matches, catalog: ReferenceCatalog) -> Matches:
+    """Select matches of stars whose motion is measured.
+
+    Exposures with fewer than 10 such stars are left out: too few for a linear part of their own.
+
+    Parameters
+    ----------
+    table : Matches
+        Matches with star codes of the catalogue.
+    catalog : ReferenceCatalog
+        Catalogue, which marks stars with an assumed motion.
+
+    Returns
+    -------
+    Matches
+        The same object if no motion of the catalogue is assumed.
+
+    Raises
+    ------
+    InputError
+        If no exposure has 10 stars with a measured motion.
+    """
+    if catalog.measured_motion.all():
+        return table
+    star = required(table.star, "stars with a measured motion are selected by their codes")
+    measured = ~np.isin(star, catalog.star[~catalog.measured_motion])
+    n = np.bincount(table.exposure[measured], minlength=len(table.exposure_names))
+    measured &= n[table.exposure] >= _MIN_STARS_OF_EXPOSURE
+    if not measured.any():
+        raise InputError(
+            f"no exposure has {_MIN_STARS_OF_EXPOSURE} stars with a measured motion, from which "
+            "the errors of the centroids are derived",
+            where=catalog.source,
+            do="give it more motions, or star lists with errors (campaign.sigma = 'columns')",
+        )
+    selected = table.select(measured, reason="no measured motion")
+    return selected.with_exposure_names(selected.exposures)
 
 
 def centroid_errors(table: Matches, total: MagnitudeErrors) -> MagnitudeErrors:

@@ -20,6 +20,8 @@ from astropy.time import Time
 from astropy.wcs import WCS
 from scipy import stats
 
+from bayesdist.app.run import Run
+from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data import Matches, read_matches
 from bayesdist.infer import load_fit, load_posterior, residuals
 from bayesdist.infer.solution.transforms import without_frames
@@ -464,6 +466,28 @@ def test_stars_without_a_motion_have_that_of_the_others_with_its_error(tmp_path)
     wide = read_matches(staged(prior, "match") / "pairs", unit="arcsec")
     years = np.abs(wide.epoch - CATALOGUE)[wide.star % 3 == 0]
     np.testing.assert_allclose(wide.sigma_u[wide.star % 3 == 0], 0.040 * years, rtol=0.05)
+
+
+@pytest.mark.parametrize("tenths", [3, 4.5, 7])
+def test_stars_without_a_motion_leave_the_centroid_errors_as_they_are(tmp_path, tenths):
+    """Errors by magnitude are those of the centroids; all stars together agree with their errors.
+
+    The errors of the catalogue are 0.3 mas with a motion, and tens of mas without one.
+    """
+    change = without_motions(lambda row: row % 20 < 2 * tenths)
+    run = staged(write(tmp_path / "in", -1, change=change), "match", "fit")
+    with Run.of(RunDirectory.open(run)) as opened:
+        errors, pairs = opened.errors, opened.matches
+    law = errors.by_magnitude
+    true = CENTROID * PIXEL
+    # 400 residuals or more on each axis: 3 per cent for one law, more for each bin
+    for sigma in law.at(pairs.mag):
+        assert np.sqrt(np.mean(sigma**2)) == pytest.approx(true, rel=0.1)
+        assert np.abs(sigma / true - 1).max() < 0.2
+    pulls = residuals(load_fit(run / "fit.nc"), pairs) / np.stack([pairs.sigma_u, pairs.sigma_v], 1)
+    for group in (pairs.star % 20 < 2 * tenths, pairs.star % 20 >= 2 * tenths):
+        pull = pulls[group][np.hypot(*pulls[group].T) < 5]
+        assert np.sqrt(np.mean(pull**2)) == pytest.approx(1.0, abs=0.15)
 
 
 def test_stars_without_a_motion_are_left_out_and_counted_if_others_are_few(tmp_path):

@@ -13,7 +13,11 @@ from astropy.wcs import WCS
 
 import bayesdist as bd
 from bayesdist.data import catalog_from_table
-from bayesdist.data.preparing import motion_error_line, select_motions
+from bayesdist.data.preparing import (
+    motion_error_line,
+    select_motions,
+    with_measured_motions,
+)
 from bayesdist.errors import InputError
 from tests.data.test_sky import POINT, catalogue, read
 from tests.reduced import FULL
@@ -354,6 +358,22 @@ def test_reliable_motions_are_selected_among_the_measured_ones():
     measured = c.select(c.measured_motion)
     np.testing.assert_array_equal(line.sigma, motion_error_line(measured).sigma)
     assert select_motions(c).assumed_motion.sum() == 300
+
+
+def test_matches_with_measured_motions_and_the_exposures_that_have_enough_of_them():
+    c = two_thirds()[2]
+    measured, assumed = c.star[c.measured_motion], c.star[c.assumed_motion]
+    star = np.concatenate([measured[:12], assumed[:40], measured[20:29], assumed[:40]])
+    x, y = np.random.default_rng(4).uniform(1, 1000, (2, len(star)))
+    exposure = np.repeat(["a", "b"], [52, 49])
+    m = bd.Matches(x, y, x, y, star=star, exposure=exposure == "b", exposure_names=("a", "b"))
+    chosen = with_measured_motions(m, c)
+    np.testing.assert_array_equal(np.sort(chosen.star), np.sort(measured[:12]))
+    assert chosen.exposure_names == ("a",)
+    with pytest.raises(InputError, match="no exposure has 10 stars with a measured motion"):
+        with_measured_motions(m.select(exposure == "b"), c)
+    only = c.select(c.measured_motion)
+    assert with_measured_motions(chosen, only) is chosen
 
 
 def seen_table(t, rng):

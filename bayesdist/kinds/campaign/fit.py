@@ -7,10 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from bayesdist.app.artefacts.stars import QUOTED, ErrorLaw
+from bayesdist.app.artefacts.stars import QUOTED
 from bayesdist.app.artefacts.stored_fit import FitArtefacts
 from bayesdist.app.run import Run
-from bayesdist.data import centroid_errors
 from bayesdist.data.matches import Matches
 from bayesdist.infer import load
 from bayesdist.infer.exposures.alone import ExposureSolutions, fit_exposures
@@ -29,7 +28,7 @@ from bayesdist.kinds.campaign.matched import affine_model_of
 from bayesdist.kinds.campaign.parts import ExposuresAlone, ExposureScatter
 from bayesdist.kinds.campaign.reference import rate_priors
 from bayesdist.kinds.campaign.series import Series
-from bayesdist.kinds.campaign.tables import fit_tables, scatter_by_magnitude, tables_section
+from bayesdist.kinds.campaign.tables import errors_with_catalogue, fit_tables, tables_section
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.model.frames import RIGID
 from bayesdist.utils.limits import TREND
@@ -50,7 +49,7 @@ def _fitted(pairs: Matches, inputs: Inputs) -> FitArtefacts:
     tables, fit_of_tables = fit_tables(pairs, inputs)
     if tables.tables:
         pairs = on_the_chips(corrected_matches(tables.tables, pairs), affine)
-    errors = _error_law(pairs, affine, inputs)
+    errors = QUOTED if inputs.has_quoted_errors else errors_with_catalogue(pairs, inputs)
     stars = errors.applied(pairs)
     rejection = Rejection(config.fit.clip_chi2, config.fit.clip_abs)
     joint = _joint(stars, affine, inputs, rejection)
@@ -78,14 +77,6 @@ def _fitted(pairs: Matches, inputs: Inputs) -> FitArtefacts:
         },
         "fit_facts": facts,
     }
-
-
-def _error_law(pairs: Matches, affine: DistortionModel, inputs: Inputs) -> ErrorLaw:
-    """Errors of the centroids by magnitude, unless the star lists have them."""
-    if inputs.has_quoted_errors:
-        return QUOTED
-    _, _, total = scatter_by_magnitude(pairs, affine, inputs)
-    return ErrorLaw(by_magnitude=centroid_errors(pairs, total), with_catalogue=True)
 
 
 def _joint(

@@ -9,8 +9,9 @@ from functools import partial
 import numpy as np
 
 from bayesdist.app.artefacts.parts import StoredLookupTables
+from bayesdist.app.artefacts.stars import ErrorLaw
 from bayesdist.app.config import Config
-from bayesdist.data.magnitude_errors import MagnitudeErrors
+from bayesdist.data import centroid_errors, with_measured_motions
 from bayesdist.data.matches import Matches
 from bayesdist.diagnose.tables import BetweenNodes, measured_between
 from bayesdist.errors import InputError
@@ -26,7 +27,7 @@ from bayesdist.infer.nodes import (
 from bayesdist.kinds.campaign.inputs import Inputs
 from bayesdist.kinds.campaign.matched import affine_model_of
 from bayesdist.kinds.campaign.reference import held_tables
-from bayesdist.model import DistortionModel, LookupTable, corrected
+from bayesdist.model import LookupTable, corrected
 from bayesdist.model.grid import grid_pixels, mesh
 from bayesdist.utils.arrays import Float
 
@@ -97,8 +98,9 @@ def fit_tables(pairs: Matches, inputs: Inputs) -> tuple[StoredLookupTables, Tabl
         if inputs.has_quoted_errors:
             fit = fit_linear(placed, model)
         else:
-            fit, _, errors = scatter_by_magnitude(placed, model, inputs)
-            pairs = pairs.with_errors(errors)
+            errors = errors_with_catalogue(placed, inputs)
+            fit = fit_linear(errors.applied(placed), model)
+            pairs = errors.applied(pairs)
         between = measured_between(pairs, fit, held, filter=filter, fitted=False)
         of_nodes = _on_the_grid(held, fit, "", grid, partial(_held_variance, held))
         return _stored(held, of_nodes, between), None
@@ -132,14 +134,17 @@ def fit_tables(pairs: Matches, inputs: Inputs) -> tuple[StoredLookupTables, Tabl
     return _stored(table_fit.tables, of_nodes, between), table_fit
 
 
-def scatter_by_magnitude(
-    pairs: Matches, model: DistortionModel, inputs: Inputs
-) -> tuple[LinearFit, Matches, MagnitudeErrors]:
-    """Fit each exposure by itself and estimate the scatter; see `fit_by_magnitude`."""
-    fit, _, errors = fit_by_magnitude(pairs, model)
-    scattered = pairs.with_errors(errors)
-    refuse_outrun_stars(inputs, fit, scattered)
-    return fit, scattered, errors
+def errors_with_catalogue(pairs: Matches, inputs: Inputs) -> ErrorLaw:
+    """Centroid errors by magnitude, which are added to each star's error of the catalogue.
+
+    Each exposure is fitted by itself (`fit_by_magnitude`), and the errors of the catalogue are
+    subtracted from the scatter (`centroid_errors`). Only stars with a measured motion are used: an
+    assumed motion makes the error of a star many times that of the others of its magnitude.
+    """
+    stars = with_measured_motions(pairs, inputs.catalog)
+    fit, _, total = fit_by_magnitude(stars, affine_model_of(inputs.config, stars))
+    refuse_outrun_stars(inputs, fit, stars.with_errors(total))
+    return ErrorLaw(by_magnitude=centroid_errors(stars, total), with_catalogue=True)
 
 
 def _with_errors(
@@ -153,9 +158,8 @@ def _with_errors(
     scatter.
     """
     model, block = affine_model_of(inputs.config, pairs), inputs.config.tables
-    _, rough_errors, _ = scatter_by_magnitude(pairs, model, inputs)
     rough = fit_with_tables(
-        rough_errors,
+        errors_with_catalogue(pairs, inputs).applied(pairs),
         model,
         filter=inputs.filter if held else "",
         beneath=held,
@@ -164,8 +168,8 @@ def _with_errors(
         max_iterations=ROUGH_ITERATIONS,
         report=_log_iteration,
     )
-    _, _, errors = scatter_by_magnitude(rough.corrected(pairs), model, inputs)
-    return pairs.with_errors(errors), rough
+    errors = errors_with_catalogue(rough.corrected(pairs), inputs)
+    return errors.applied(pairs), rough
 
 
 def _stored(
