@@ -66,3 +66,24 @@ def test_the_run_goes_on_with_errors_scaled(both):
     assert small["outliers"]["fraction"]["mean"] < 0.01
     core = np.hypot(small["outliers"]["jitter"]["mean"], 0.05)
     assert small["outliers"]["scale"]["mean"] > core
+
+
+@pytest.mark.parametrize("names", [("ERRX2WIN_IMAGE", "ERRY2WIN_IMAGE"), ("x_err", "y_err"), ()])
+def test_init_drafts_centroid_errors_beside_those_of_the_catalogue(tmp_path, names):
+    """Errors of ra and dec alone are the catalogue's, and then the others come by magnitude."""
+    rng = np.random.default_rng(5)
+    x, y = rng.uniform(1, 1000, (2, 60))
+    table = Table({"x": x, "y": y, "ra": 150 + 5e-5 * x, "dec": 2 + 5e-5 * y})
+    table["ra_error"] = table["dec_error"] = 0.2
+    table["mag"] = rng.uniform(14, 20, 60)
+    for name in names:
+        table[name] = 4e-4 if name.startswith("ERR") else 0.02
+    for name in ("ra_error", "dec_error"):
+        table[name].unit = "mas"
+    table.write(tmp_path / "stars.ecsv")
+    good("init", tmp_path / "c.toml", "--matches", tmp_path / "stars.ecsv")
+    text = (tmp_path / "c.toml").read_text()
+    assert ('sigma = "columns"' in text) == bool(names)
+    assert ("are the catalogue's alone" in text) == (not names)
+    for key, name in zip(("sigma_x", "sigma_y"), names, strict=False):
+        assert f'{key} = "{name}"' in text

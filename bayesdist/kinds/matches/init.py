@@ -264,7 +264,8 @@ def _read(
             break
     layout = table_layout(matches, columns)
     columns_used = {} if layout is None else layout.taken
-    if sigma == "columns" and "sigma_ra" in columns_used and table.has_mag:
+    of_catalogue = "sigma_ra" in columns_used and "sigma_x" not in columns_used
+    if sigma == "columns" and of_catalogue and table.has_mag:
         errors = f"{columns_used['sigma_ra']}, {columns_used['sigma_dec']}"
         why = f"the errors of the table ({errors}) are the catalogue's alone"
         return table, line, f'"by_magnitude"        # {why}', False
