@@ -7,12 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from astropy.table import Table
-from astropy.wcs import WCS
+from astropy.wcs import WCS, Sip
 from numpy.polynomial import legendre
 
 import bayesdist as bd
 from bayesdist.app.config import parse_config
-from bayesdist.app.kinds.plausibility import doubts_on_stars, refuse_empty_segments
+from bayesdist.app.kinds.plausibility import (
+    doubts_on_stars,
+    refuse_empty_segments,
+    scatter_about_polynomials,
+)
 from bayesdist.data import Matches, read_matches, write_partitioned
 from bayesdist.errors import ConfigError, DegenerateError, InputError
 from bayesdist.model import Chip, DistortionModel, TimeDependence
@@ -125,9 +129,10 @@ def test_fewer_than_three_stars_for_each_term_are_named(rng, n, named):
 # -- positions made from the pixels ---------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("decimals", "named"), [(7, True), (5, False)])
+@pytest.mark.parametrize("decimals", [7, 5])
 @pytest.mark.parametrize("quoted", [True, False])
-def test_positions_that_a_wcs_made_from_the_pixels_are_named(rng, decimals, named, quoted):
+def test_positions_that_a_wcs_made_from_the_pixels_are_named(rng, decimals, quoted):
+    """Five decimals are 0.009 px, which is doubted unless the quoted errors are as small."""
     wcs = WCS(naxis=2)
     wcs.wcs.ctype, wcs.wcs.crval, wcs.wcs.crpix = ["RA---TAN", "DEC--TAN"], [150, 30], [500, 400]
     wcs.wcs.cdelt = [-4e-4, 4e-4]  # degrees, so that 7 decimals are 0.0001 px
@@ -136,11 +141,83 @@ def test_positions_that_a_wcs_made_from_the_pixels_are_named(rng, decimals, name
     table = Table({"x": x, "y": y, "ra": np.round(ra, decimals), "dec": np.round(dec, decimals)})
     table["mag"] = 12 + x / 100
     stars = read_matches(table, sigma=0.05 if quoted else "by_magnitude")
-    if not named:
-        assert not any("computed from the pixels" in text for text in doubts(stars))
+    if decimals == 5:
+        texts = [text for text in doubts(stars) if "been computed from the pixels" in text]
+        assert len(texts) == (not quoted)
+        assert all("(5 of ra, 5 of dec) alone explain this scatter" in text for text in texts)
         return
     with pytest.raises(InputError, match=r"computed from the pixels by a WCS.*'bayesdist convert"):
         doubts(stars)
+
+
+def made_by_a_sip_wcs(rng, noise, n=300):
+    """Table as of SExtractor; positions by astropy's SIP, 0.2 arcsec per pixel, with some noise."""
+    wcs = WCS(naxis=2)
+    wcs.wcs.ctype, wcs.wcs.crval = ["RA---TAN-SIP", "DEC--TAN-SIP"], [150, 40]
+    wcs.wcs.crpix, wcs.wcs.cdelt = [500.5, 400.5], [-0.2 / 3600, 0.2 / 3600]
+    a, b = np.zeros((2, 3, 3))
+    a[2, 0], a[1, 1], b[0, 2] = 2e-6, 1e-6, 1.6e-6
+    wcs.sip = Sip(a, b, None, None, wcs.wcs.crpix)
+    x, y = rng.uniform(1, 1000, n), rng.uniform(1, 800, n)
+    ra, dec = wcs.all_pix2world(x, y, 1)
+    east, north = rng.normal(0, noise * 0.2 / 3600, (2, n))
+    ra, dec = ra + east / np.cos(np.radians(dec)), dec + north
+    return Table({"x": x, "y": y, "ra": ra, "dec": dec, "mag": rng.uniform(14, 20, n)})
+
+
+@pytest.mark.parametrize(
+    ("noise", "decimals", "words"),
+    [
+        (5e-4, None, "far better than detectors measure: they were probably computed"),
+        (0.0, (4, 7), "(4 of x, 4 of y, 7 of ra, 7 of dec) alone explain this scatter"),
+        (0.0, (3, 6), "(3 of x, 3 of y, 6 of ra, 6 of dec) alone explain this scatter"),
+        (0.02, (3, 6), ""),
+        (0.02, None, ""),
+    ],
+)
+def test_positions_made_by_a_wcs_are_doubted_with_errors_by_magnitude(rng, noise, decimals, words):
+    """Errors by magnitude are estimated from the scatter, and so is a number equal to it."""
+    table = made_by_a_sip_wcs(rng, noise)
+    if decimals is not None:
+        for name, n in zip(("x", "y", "ra", "dec"), np.repeat(decimals, 2), strict=True):
+            table[name] = table[name].round(n)
+    run = bd.calibrate(
+        table,
+        order=3,
+        size=(1000, 800),
+        sigma="by_magnitude",
+        terms=[bd.UserTerm("reference catalogue", "systematic", 0.0, 0.0, "arcsec", "none")],
+        requirements=bd.Requirement("field-wide", "p95", 0.1, unit="arcsec"),
+    )
+    [margin] = run.margins
+    doubted = "computed from the pixels by a WCS" in margin.reason
+    assert doubted == bool(words) and words in margin.reason
+    assert margin.verdict == ("undecided" if doubted else "met")
+    scatter = scatter_about_polynomials(run.matches)
+    for sigma, named in ((scatter, doubted), (8 * scatter, False)):
+        of_number = doubts(run.matches.with_errors(sigma))
+        assert any("computed from the pixels by a WCS" in text for text in of_number) == named
+
+
+def test_errors_by_magnitude_count_as_unquoted_in_the_commands(rng, tmp_path):
+    data = {"matches": "stars.ecsv", "sigma": "by_magnitude"}
+    sections = {"data": data, "detector": {"name": "A", "size": (1000, 800)}, "model": {"order": 3}}
+    doubtful = write_job(tmp_path / "doubtful", made_by_a_sip_wcs(rng, 5e-4), **sections)
+    said = cli("check", doubtful)
+    assert said.code == 0, said.err
+    assert said.out.lower().count("the reference positions follow a polynomial") == 1
+    made = write_job(tmp_path / "made", made_by_a_sip_wcs(rng, 0.0), **sections)
+    said = cli("check", made)
+    assert said.code == 1 and "with --sample if it has no distortion" in said.err
+
+
+def test_positions_on_whole_pixels_of_a_design_are_not_taken_for_rounded(rng):
+    """Holes of a mask at whole numbers, measured to 0.02 px: far less than their last decimal."""
+    found = stars(rng)
+    x, y = np.round(found.x), np.round(found.y)
+    noise = rng.normal(0, 0.02, (2, len(found)))
+    found = replace(found, x=x, y=y, u=x + noise[0], v=y + noise[1])
+    assert doubts(found.without("sigma_u", "sigma_v")) == []
 
 
 def test_a_scatter_that_a_mask_may_have_is_only_doubted_without_quoted_errors(rng):

@@ -41,7 +41,7 @@ def test_cuts_are_recognised(n, sigmas, known):
     """As far as stars are missing: beyond 4 sigma, 20 of 60,000."""
     radius = sigmas * SIGMA if known else None
     found = truncation(*cut(Scene(n, 2), 1, sigmas), match_radius=radius)
-    assert found.significant and found.remedy == "match again with a wider radius"
+    assert found.significant and found.remedy.startswith("match again with a wider radius")
     assert "end too abruptly" in found.finding and "nothing of the quoted errors" in found.finding
     kept = 1 - np.exp(-(sigmas**2) / 2) * (1 + sigmas**2 / 2)
     kept /= 1 - np.exp(-(sigmas**2) / 2)

@@ -9,7 +9,9 @@ from numpy.polynomial import legendre
 
 from bayesdist.app.config import Config
 from bayesdist.app.kinds.sampling import doubts_on_numbers
+from bayesdist.app.run import Run
 from bayesdist.data import Matches
+from bayesdist.data.sky import sky_of_plane
 from bayesdist.errors import InputError
 from bayesdist.model import DistortionModel, TimeDependence
 from bayesdist.model.basis import MAX_ORDER, n_terms, polynomial_terms
@@ -27,6 +29,12 @@ MADE_FROM_PIXELS = 1e-3
 ROUNDED_POSITIONS = 1e-2  # only if errors are quoted, with a warning
 CERTAINLY_MADE = 1e-4  # if no errors are quoted
 FAR_BELOW = 0.1  # and less than this fraction of the quoted errors
+# ratios of the scatter to the rounding of a table between which the rounding explains it: 1.0 to
+# 1.3 for the robust scatter of rounded numbers, widened for few stars
+LIKE_ROUNDING = (0.75, 1.5)
+MOST_DECIMALS = 9  # of a table; with more, rounding is not seen
+NEARLY_WHOLE = 1e-3  # largest deviation from a whole number of units of the last decimal
+SAME_SCATTER = 0.03  # relative difference below which a given error is the scatter itself
 ORDER = 4
 OTHER_ORDERS = (1, 2, 9)  # orders for few stars, and for headers of high order
 STARS_OF_OTHER_ORDERS = 600  # to which these are fitted
@@ -53,6 +61,27 @@ def doubts_on_stars(stars: Matches, model: DistortionModel, config: Config) -> l
         doubt = config.catalogue.catalogue().doubt_on_pointings(apart)
         doubts += [doubt] if doubt else []
     return [*doubts, *_doubts_on_order(stars, model.order)]
+
+
+def doubts_on_run(run: Run) -> list[str]:
+    """Sentences about unusual properties of the matched stars of a run."""
+    return doubts_on_stars(_with_quoted_errors(run), run.model, run.config)
+
+
+def doubt_on_positions(run: Run) -> str:
+    """Sentence about positions that were probably computed from the pixels; empty if none were."""
+    stars = _with_quoted_errors(run)
+    scale = _scale(stars)
+    if len(stars) < FEWEST or scale is None:
+        return ""
+    return next(_doubts_on_scatter(stars, scale), "")
+
+
+def _with_quoted_errors(run: Run) -> Matches:
+    """Sample of the stars of a run without errors by magnitude, which their scatter determines."""
+    if run.errors.by_magnitude is None:
+        return run.sample
+    return run.sample.without("sigma_u", "sigma_v", "rho_uv")
 
 
 def _distance_of_exposures(stars: Matches) -> float:
@@ -165,27 +194,88 @@ def _doubts_on_scatter(stars: Matches, scale: float) -> Iterator[str]:
         return
     in_pixels = float(f"{scatter / scale:.2g}")
     certain, doubtful = CERTAINLY_MADE, MADE_FROM_PIXELS
-    if stars.has_sigma:
+    rounding = "" if _quotes_errors(stars) else _rounding_like(stars, scatter)
+    if _quotes_errors(stars):
         sigma = np.minimum(stars.column("sigma_u"), stars.column("sigma_v"))
         far_below = FAR_BELOW * float(np.median(sigma)) / scale
         certain = max(NOISE_FREE, min(MADE_FROM_PIXELS, far_below))
         doubtful = min(ROUNDED_POSITIONS, far_below)
+    follow = f"the reference positions follow a polynomial of the pixels to {in_pixels:.1g} px"
     if in_pixels < certain:
         raise InputError(
-            f"the reference positions follow a polynomial of the pixels to {in_pixels:.1g} px, "
-            "which no detector reaches: they were computed from the pixels by a WCS, or are those "
-            "of a design, and without the noise of measured positions there are no errors to find",
+            f"{follow}, which no detector reaches: they were computed from the pixels by a WCS, or "
+            "are those of a design, and without the noise of measured positions there are no "
+            "errors to find",
             where=", ".join(stars.sources),
             do="match the detections with a catalogue; the WCS of the image becomes a header of "
-            "another form by 'bayesdist convert IMAGE.fits --to sip', and a design a calibration "
-            "without errors by bayesdist.fit_linear in Python",
+            "another form by 'bayesdist convert IMAGE.fits --to sip' (with --sample if it has no "
+            "distortion or another projection), and a design a calibration without errors by "
+            "bayesdist.fit_linear in Python",
         )
     if in_pixels < doubtful:
         yield (
-            f"the reference positions follow a polynomial of the pixels to {in_pixels:.1g} px, far "
-            "better than detectors measure: they were probably computed from the pixels by a WCS, "
-            "and a fit only gives back that WCS; match the detections with a catalogue"
+            f"{follow}, far better than detectors measure{rounding and f', and {rounding}'}: they "
+            "were probably computed from the pixels by a WCS, and a fit only gives back that WCS; "
+            "match the detections with a catalogue"
         )
+    elif rounding:
+        yield (
+            f"{follow}, and {rounding}: no noise of a measurement is seen, so that they may have "
+            "been computed from the pixels by a WCS, and a fit would only give back that WCS; "
+            "match the detections with a catalogue or, if the positions were measured, write the "
+            "table with more decimals or state their errors"
+        )
+
+
+def _quotes_errors(stars: Matches) -> bool:
+    """True if stars have errors other than their scatter about a polynomial, drafted by `init`."""
+    if not stars.has_sigma:
+        return False
+    sigma = np.concatenate([stars.column("sigma_u"), stars.column("sigma_v")])
+    scatter = scatter_about_polynomials(stars)
+    is_scatter = scatter is not None and abs(scatter - sigma[0]) <= SAME_SCATTER * sigma[0]
+    return not (is_scatter and np.ptp(sigma) == 0)
+
+
+def _rounding_like(stars: Matches, scatter: float) -> str:
+    """Clause on decimals of the table that explain the scatter; empty if they do not.
+
+    `scatter` is in the unit of u and v.  Positions on the sky have the decimals of right ascension
+    and declination, unless proper motions have moved them.
+    """
+    plane, names = (stars.u, stars.v), ("u", "v")
+    unit, stretch = 1.0, np.ones(2)
+    if stars.tangent_point is not None and stars.unit in DEGREES:
+        unit = DEGREES[stars.unit]
+        plane = sky_of_plane(*(3600 * unit * z for z in plane), stars.tangent_point)
+        names, stretch = ("ra", "dec"), np.array([np.cos(np.radians(stars.tangent_point[1])), 1])
+    pixels = [_decimals(z) for z in (stars.x, stars.y)]
+    decimals = [_decimals(z) for z in plane]
+    step = _step(pixels) * (_scale(stars) or 1.0)
+    steps = np.array([_step([n]) for n in decimals]) * stretch / unit
+    rounding = float(np.hypot(step, steps.max()) / np.sqrt(12))
+    if not rounding or not LIKE_ROUNDING[0] <= scatter / rounding <= LIKE_ROUNDING[1]:
+        return ""
+    words = [
+        f"{n} of {name}"
+        for name, n in zip(("x", "y", *names), (*pixels, *decimals), strict=True)
+        if n is not None
+    ]
+    return f"the decimals of the table ({', '.join(words)}) alone explain this scatter"
+
+
+def _step(decimals: list[int | None]) -> float:
+    """Largest unit of the last decimal; 0 if there are no decimals."""
+    return max((10.0**-n for n in decimals if n is not None), default=0.0)
+
+
+def _decimals(values: Float) -> int | None:
+    """Decimals that numbers were rounded to; None if they have more than `MOST_DECIMALS`."""
+    for n in range(MOST_DECIMALS + 1):
+        scaled = values * 10.0**n
+        if np.abs(scaled - np.round(scaled)).max() <= NEARLY_WHOLE:
+            return n
+    return None
 
 
 def _smallest_scatter(stars: Matches) -> float | None:

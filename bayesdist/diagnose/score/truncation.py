@@ -30,7 +30,7 @@ from bayesdist.utils.limits import SCORE_TESTS
 
 TRUNCATION = Family(
     "truncation",
-    "match again with a wider radius",
+    "match again with a wider radius, or write more decimals if the scatter is that of rounding",
     "",
     "the residuals do not end abruptly",
     group="matching",

@@ -10,7 +10,7 @@ from typing import cast
 from bayesdist.app.artefacts.stars import QUOTED, ErrorLaw, RunInput
 from bayesdist.app.artefacts.stored_fit import load_errors
 from bayesdist.app.kinds.kind import RunKind
-from bayesdist.app.kinds.plausibility import doubts_on_stars
+from bayesdist.app.kinds.plausibility import doubt_on_positions, doubts_on_run
 from bayesdist.app.run import Run
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data import Matches
@@ -21,6 +21,7 @@ from bayesdist.errors import InputError
 from bayesdist.kinds.matches.config import MatchesConfig
 from bayesdist.kinds.matches.sources import read_configured, source_of
 from bayesdist.kinds.matches.stars import fit_stars, match_stars, read_stars
+from bayesdist.utils.checks import LARGER, Check
 
 
 class MatchesKind(RunKind[MatchesConfig, Matches]):
@@ -48,7 +49,7 @@ class MatchesKind(RunKind[MatchesConfig, Matches]):
             yield logging.INFO, note
         for reason, count in matches.rejected.items():
             yield logging.INFO, f"{count} rows were left out in reading: {reason}"
-        for text in doubts_on_stars(run.sample, run.model, run.config):
+        for text in doubts_on_run(run):
             yield logging.WARNING, text
         shift = epoch_shift(run.sample, fit)
         if shift is not None and shift.significant:
@@ -62,6 +63,13 @@ class MatchesKind(RunKind[MatchesConfig, Matches]):
             yield logging.INFO, run.added_errors.sentence(fit.unit)
         if majority:
             yield logging.WARNING, majority
+
+    def checks(self, run: Run) -> tuple[Check, ...]:
+        """Check of positions that were probably computed from the pixels; empty if none were."""
+        text = doubt_on_positions(run)
+        if not text:
+            return ()
+        return (Check("Matching", "Origin of the positions", "", "", "warn", text, LARGER),)
 
     def source(self, directory: RunDirectory) -> RunInput | None:
         """Matches in the format of a mission; None for tables."""

@@ -9,7 +9,7 @@ from tempfile import TemporaryDirectory
 from bayesdist.app.artefacts.stars import in_circle
 from bayesdist.app.assessment.error_terms import idle_dates
 from bayesdist.app.config import load_config
-from bayesdist.app.kinds.plausibility import doubts_on_stars
+from bayesdist.app.kinds.plausibility import doubts_on_run
 from bayesdist.app.kinds.sampling import naming_displaced_stars
 from bayesdist.app.rehearsal import rehearse
 from bayesdist.app.run import Run
@@ -84,8 +84,9 @@ def _lines(run: Run) -> Iterator[str]:
             yield f"geometry     {chip.mirrored}"
     yield _cost(run)
     idle = idle_dates(config, config.requirements())
+    stated = {check.sentence for check in run.checks}
     for text in (
-        *doubts_on_stars(run.sample, model, config),
+        *(text for text in doubts_on_run(run) if text not in stated),
         *(text for chip in chips for text in chip.warnings),
         *warnings_of(run.checks),
         *([idle] if idle else []),
