@@ -147,7 +147,7 @@ def test_concatenate_joins_equal_names_and_counts():
 def test_concatenate_refuses_what_does_not_fit():
     with pytest.raises(InputError, match=r"unit is mas, but pix in stars\.ecsv"):
         Matches.concatenate([table(), table(unit="mas", sources=("b",))])
-    with pytest.raises(InputError, match=r"b: has no 'mag', but stars\.ecsv has"):
+    with pytest.raises(InputError, match=r"b: has no 'mag', but stars\.ecsv does"):
         Matches.concatenate([table(mag=np.ones(5)), table(sources=("b",))])
     with pytest.raises(InputError):
         Matches.concatenate([])

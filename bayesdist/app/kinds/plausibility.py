@@ -247,7 +247,8 @@ def _rounding_like(stars: Matches, scatter: float) -> str:
     unit, stretch = 1.0, np.ones(2)
     if stars.tangent_point is not None and stars.unit in DEGREES:
         unit = DEGREES[stars.unit]
-        plane = sky_of_plane(*(3600 * unit * z for z in plane), stars.tangent_point)
+        xi, eta = (3600 * unit * z for z in plane)
+        plane = sky_of_plane(xi, eta, stars.tangent_point)
         names, stretch = ("ra", "dec"), np.array([np.cos(np.radians(stars.tangent_point[1])), 1])
     pixels = [_decimals(z) for z in (stars.x, stars.y)]
     decimals = [_decimals(z) for z in plane]
