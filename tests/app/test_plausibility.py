@@ -294,8 +294,10 @@ def test_computed_positions_are_refused_in_python_and_on_disk(rng, tmp_path):
 
 
 def test_small_errors_that_are_quoted_are_believed(rng):
-    found = stars(rng, sigma=1e-4)
-    noise = rng.normal(0, 1e-4, (2, 200))
+    """Unless all are equal to the scatter, as in a draft of init."""
+    sigma = rng.uniform(0.5e-4, 1.5e-4, 200)
+    found = replace(stars(rng), sigma_u=sigma, sigma_v=sigma)
+    noise = sigma * rng.normal(size=(2, 200))
     found = replace(found, u=found.x + noise[0], v=found.y + noise[1])
     assert doubts(found) == []
 
