@@ -260,8 +260,10 @@ def test_addresses_are_no_paths(address, tmp_path, capsys):
 
 def test_only_the_scheduler_that_is_named_is_connected_to(tmp_path):
     """And its workers, which hand over results themselves."""
-    x, y = np.random.default_rng(1).uniform(1, 100, (2, 50))
-    Table({"x": x, "y": y, "u": x, "v": y}).write(tmp_path / "a.csv")
+    rng = np.random.default_rng(1)
+    x, y = rng.uniform(1, 100, (2, 50))
+    u, v = np.stack([x, y]) + rng.normal(0, 0.01, (2, 50))
+    Table({"x": x, "y": y, "u": u, "v": v}).write(tmp_path / "a.csv")
     with LocalCluster(
         n_workers=1, threads_per_worker=1, processes=False, protocol="tcp", host="127.0.0.1",
         dashboard_address=None, silence_logs=logging.CRITICAL,

@@ -339,7 +339,7 @@ def test_what_makes_no_sense_is_refused():
         camera().wcs(epoch=57000.0)
     exact = replace(camera(), errors="none").wcs()
     for asked in (lambda: exact.covariance(1, 1), lambda: exact.draw(3, 1)):
-        with pytest.raises(InputError, match="has no errors"):
+        with pytest.raises(InputError, match=r"has no .*errors"):
             asked()
     with pytest.raises(InputError, match="neither a seed nor a generator"):
         camera().wcs().draw(3, "seed")

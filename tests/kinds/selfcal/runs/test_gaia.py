@@ -64,8 +64,7 @@ def solved(data_dir, tmp_path_factory):
     )
     run = fitted(folder / "run", config)
     others = read_catalog(folder / "others.ecsv")
-    measured = (others.sigma_pm_u > 0) & (others.sigma_pm_v > 0)
-    return run, others.select(measured)
+    return run, others.select(others.measured_motion)
 
 
 def test_gaia_fixes_what_the_detections_leave_open(solved):
