@@ -110,15 +110,16 @@ class DrawnErrors:
         ]
         if all(pair == (term, term) for pair, term in zip(variants, self.terms, strict=True)):
             return ()
-        out = []
-        for choice in zip(*variants, strict=True):
-            random = generators(choice, self.seed)
-            draws = tuple(
-                old if new is term else new.draw(self.n_draws, rng)
-                for old, term, new, rng in zip(self.draws, self.terms, choice, random, strict=True)
-            )
-            out.append(replace(self, terms=choice, draws=draws, further=None, _cache={}))
-        return tuple(out)
+        return tuple(self.with_terms(choice) for choice in zip(*variants, strict=True))
+
+    def with_terms(self, terms: tuple[ErrorTerm, ...]) -> DrawnErrors:
+        """Draws of other terms in place of these, one for each; equal terms keep their draws."""
+        random = generators(terms, self.seed)
+        draws = tuple(
+            old if new is term else new.draw(self.n_draws, rng)
+            for old, term, new, rng in zip(self.draws, self.terms, terms, random, strict=True)
+        )
+        return replace(self, terms=terms, draws=draws, further=None, _cache={})
 
     def statistics(
         self,

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from bayesdist.data.covariances import LARGEST_RHO, with_correlations, without_sizes
 from bayesdist.data.reading.columns import is_on_sky, plane_unit, position_unit
-from bayesdist.data.reading.motions import with_prior_motions
+from bayesdist.data.reading.motions import prior_in_mas, with_prior_motions
 from bayesdist.data.reading.table import as_table, with_sky_columns
 from bayesdist.data.sky import (
     CORRELATIONS,
@@ -37,7 +37,7 @@ from bayesdist.data.tables.names import ALIASES, find_columns
 from bayesdist.errors import InputError
 from bayesdist.files.tables import read_table
 from bayesdist.utils.arrays import Bool, Float, Int
-from bayesdist.utils.quantities import Direction, Epoch, Number, direction_in, value_in, year_of
+from bayesdist.utils.quantities import Direction, Epoch, Number, direction_in, year_of
 
 _PAIRS = (("sigma_u", "sigma_v"), ("pm_u", "pm_v"), ("sigma_pm_u", "sigma_pm_v"))
 _PARALLAX = ("parallax", "sigma_parallax")
@@ -516,7 +516,7 @@ def catalog_from_table(
     if epoch is not None:
         epoch = year_of(epoch, where=source)
     if motion_prior is not None:
-        motion_prior = value_in(motion_prior, "mas / yr", "motion_prior", where=source)
+        motion_prior = prior_in_mas(motion_prior, source)
     point = None
     if tangent_point is not None:
         point = direction_in(tangent_point, "tangent_point", where=source)

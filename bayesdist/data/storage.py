@@ -302,9 +302,8 @@ class StoredFile:
     @property
     def moves(self) -> bool:
         """True if positions are moved to the epochs of the exposures, with errors of motions."""
-        found, options = self.found, self.options
-        dated = "catalogue_epoch" in found or options.catalogue_epoch is not None
-        return found.keys() >= NEEDED and dated and ("epoch" in found or options.epoch is not None)
+        has_errors = self.found.keys() >= NEEDED
+        return has_errors and are_moved(self.options, self.found, self.source)
 
     @property
     def source(self) -> str:
@@ -350,7 +349,7 @@ class StoredFile:
             yield out
 
     def _of_motions(self) -> list[str]:
-        """Columns with motions and parallaxes, and those of which their prior depends."""
+        """Columns with motions and parallaxes, and those that their prior depends on."""
         keys = (*MOTIONS, "parallax", "sigma_parallax", "mag")
         names = [self.found[key] for key in keys if key in self.found]
         return list(dict.fromkeys([*names, *unnamed_columns(self.part.colnames)]))

@@ -277,9 +277,7 @@ def refuse_open_quotes(lines: Sequence[str], table: Table, mark: str | None, *, 
 def _numbers_within(cell: str, mark: str | None) -> int:
     """Number of numbers, and of empty cells between separators, in the lines of a cell."""
     lines = [line.split(mark) for line in cell.splitlines()]
-    words = [
-        word.strip(_BLANKS) for line in lines if len(line) > 1 or line != [""] for word in line
-    ]
+    words = [word.strip(_BLANKS) for line in lines if line != [""] for word in line]
     return sum(not word or _NUMBER.fullmatch(word) is not None for word in words)
 
 

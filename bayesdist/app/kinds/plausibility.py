@@ -50,14 +50,12 @@ BEST_ORDER = 1.2  # ratio of scatters below which two orders are equally good
 MOST_STARS = 1500  # used to compare orders
 YEARS = (1950.0, 2100.0)
 
-DEGREES = {"deg": 1.0, "arcsec": 1.0 / 3600.0, "mas": 1.0 / 3.6e6}  # of a unit of u and v
-
 
 def doubts_on_stars(stars: Matches, model: DistortionModel, config: Config) -> list[str]:
     """Sentences about unusual properties of matched stars (all or a sample, in memory)."""
     doubts = list(_doubts(stars, model, config.detector.scale_mas))
-    if config.catalogue is not None and model.unit in DEGREES:
-        apart = DEGREES[model.unit] * _distance_of_exposures(stars)
+    if config.catalogue is not None and model.unit in IN_DEGREES:
+        apart = IN_DEGREES[model.unit] * _distance_of_exposures(stars)
         doubt = config.catalogue.catalogue().doubt_on_pointings(apart)
         doubts += [doubt] if doubt else []
     return [*doubts, *_doubts_on_order(stars, model.order)]
@@ -194,8 +192,9 @@ def _doubts_on_scatter(stars: Matches, scale: float) -> Iterator[str]:
         return
     in_pixels = float(f"{scatter / scale:.2g}")
     certain, doubtful = CERTAINLY_MADE, MADE_FROM_PIXELS
-    rounding = "" if _quotes_errors(stars) else _rounding_like(stars, scatter)
-    if _quotes_errors(stars):
+    quoted = _quotes_errors(stars)
+    rounding = "" if quoted else _rounding_like(stars, scatter)
+    if quoted:
         sigma = np.minimum(stars.column("sigma_u"), stars.column("sigma_v"))
         far_below = FAR_BELOW * float(np.median(sigma)) / scale
         certain = max(NOISE_FREE, min(MADE_FROM_PIXELS, far_below))
@@ -245,8 +244,8 @@ def _rounding_like(stars: Matches, scatter: float) -> str:
     """
     plane, names = (stars.u, stars.v), ("u", "v")
     unit, stretch = 1.0, np.ones(2)
-    if stars.tangent_point is not None and stars.unit in DEGREES:
-        unit = DEGREES[stars.unit]
+    if stars.tangent_point is not None and stars.unit in IN_DEGREES:
+        unit = IN_DEGREES[stars.unit]
         xi, eta = (3600 * unit * z for z in plane)
         plane = sky_of_plane(xi, eta, stars.tangent_point)
         names, stretch = ("ra", "dec"), np.array([np.cos(np.radians(stars.tangent_point[1])), 1])

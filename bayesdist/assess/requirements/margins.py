@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from bayesdist.assess.domain import EvaluationDomain, WorstPosition
-from bayesdist.assess.drawn import DrawnErrors, generators
+from bayesdist.assess.drawn import DrawnErrors
 from bayesdist.assess.requirements.requirement import Requirement
 from bayesdist.assess.requirements.verdict import (
     MISSED_BELOW,
@@ -245,12 +245,7 @@ def _ways(
     )
     if terms == errors.terms:
         return first, ()
-    random = generators(terms, errors.seed)
-    draws = tuple(
-        old if new is term else new.draw(errors.n_draws, rng)
-        for old, term, new, rng in zip(errors.draws, errors.terms, terms, random, strict=True)
-    )
-    other = replace(errors, terms=terms, draws=draws, further=None, _cache={})
+    other = errors.with_terms(terms)
     return first, (other, *other.treatments(grid))
 
 

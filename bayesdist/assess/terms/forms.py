@@ -6,13 +6,14 @@ rows.
 
 `draw` of a term returns one of these forms:
 
-- `Polynomials`: errors of parameters, polynomials of the pixel for each chip and epoch. If the
-  observer fits shift and rotation of an exposure, the part that this fit absorbs is subtracted from
-  these errors only;
+- `Polynomials`: errors of parameters, polynomials of the pixel for each chip and epoch;
 - `Functions`: sums of arbitrary functions of the position;
 - `Independent`: errors that are independent between positions;
 - `Known`: displacements, which are not errors;
 - `Together`: correlated rows of one term, which use the same draw number.
+
+If the observer fits shift and rotation of an exposure, the part that this fit absorbs is subtracted
+from `Polynomials` and `Functions`.
 """
 
 from __future__ import annotations
@@ -510,8 +511,7 @@ class FunctionField(DrawnField):
             parts.append(drawn if phi is None else np.swapaxes(drawn @ phi.T, 1, 2))
         out = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
         if self.absorbed is not None:
-            absorbed = _of_draws(self.absorbed.by_row, draws) @ self._rigid.reshape(-1, 3).T
-            out = out - absorbed.reshape(len(absorbed), -1, 2)
+            out = out - _displacements(_of_draws(self.absorbed.by_row, draws), self._rigid)
         size = scale.get(self.of.row.name, 1.0)
         return np.asarray(out if size == 1.0 else size * out, float)
 
@@ -617,13 +617,16 @@ class FunctionField(DrawnField):
         x, y = mesh(*grid_pixels(size, DEFAULT_GRID))
         values = self.of.values(chip, x, y)
         if self.absorbed is not None:
-            absorbed = (
-                self.absorbed.by_row @ self.absorbed.alignment.at(chip, x, y).reshape(-1, 3).T
-            )
-            values = values - absorbed.reshape(len(absorbed), -1, 2)
+            rigid = self.absorbed.alignment.at(chip, x, y)
+            values = values - _displacements(self.absorbed.by_row, rigid)
         by_draw = np.sqrt(np.mean(np.square(values, dtype=float), axis=(1, 2)))
         mean = float(by_draw.mean())
         return float(by_draw.std()) / mean if mean > 0 else 0.0
+
+
+def _displacements(fitted: NDArray[np.floating], rigid: Float) -> Float:
+    """Displacements (n, N, 2) by fitted shifts and rotations (n, 3) of which `rigid` (N, 2, 3)."""
+    return np.asarray(fitted @ rigid.reshape(-1, 3).T).reshape(len(fitted), -1, 2)
 
 
 def _roots(covariance: Float) -> Float:

@@ -87,8 +87,8 @@ class AngularCovariance:
         # `beyond` is at most the sum of v / (k s)
         largest = 4.0 * n * sum(v / s for v, s in self.parts) / float(self.beyond(smallest))
         k = np.geomspace(smallest, max(largest, 2.0 * smallest), 4000)
-        return np.exp(np.interp(np.log(quantiles[::-1]), np.log(self.beyond(k))[::-1],
-                                np.log(k)[::-1])[::-1])  # fmt: skip
+        falling = np.log(self.beyond(k))  # numpy interpolates over rising values
+        return np.exp(np.interp(np.log(quantiles), falling[::-1], np.log(k)[::-1]))
 
 
 class SplitField:

@@ -20,6 +20,7 @@ from bayesdist.data.tables.checks import absent, row_number, zero_motions
 from bayesdist.data.tables.column import EncodedColumn, Quantities, TableColumns
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Bool, Float
+from bayesdist.utils.quantities import Number, value_in
 
 log = logging.getLogger("bayesdist")
 
@@ -117,21 +118,28 @@ def with_prior_motions(
     return Filled(out, stars.missing, (*notes, note))
 
 
+def prior_in_mas(motion_prior: Number, where: str) -> float:
+    """Standard deviation of a prior of motions in mas per year; InputError unless it is positive.
+
+    Plain numbers are in mas per year.
+    """
+    sigma = value_in(motion_prior, "mas / yr", "motion_prior", where=where)
+    if not 0 < sigma < np.inf:
+        raise InputError(
+            f"motion_prior is {sigma}", where=where, do="give a positive number of mas per year"
+        )
+    return sigma
+
+
 def refuse_unused_prior(
     sigma_mas_yr: float | None, found: Mapping[str, str], *, where: str, on_plane: bool = False
 ) -> None:
-    """Raise InputError if a prior of motions is given that is not positive, or has no effect.
+    """Raise InputError if a prior of motions is given that has no effect.
 
     `found` are the columns by quantity.  `on_plane` is True for positions u, v.
     """
     if sigma_mas_yr is None:
         return
-    if not 0 < sigma_mas_yr < np.inf:
-        raise InputError(
-            f"motion_prior is {sigma_mas_yr}",
-            where=where,
-            do="give a positive number of mas per year",
-        )
     lacking = [key for key in (*MOTIONS, "sigma_ra", "sigma_dec") if key not in found]
     if lacking:
         if on_plane:

@@ -11,6 +11,7 @@ from typing import Any, TypedDict
 import numpy as np
 
 from bayesdist.data.magnitude_errors import no_magnitudes
+from bayesdist.data.reading.motions import prior_in_mas
 from bayesdist.data.repeated import check_same_position
 from bayesdist.data.tables.checks import check_not_finite
 from bayesdist.data.tables.column import length_in_mm
@@ -108,22 +109,19 @@ class ReadOptions:
         check_sigma(self.sigma)
         check_not_finite(self.not_finite)
         check_same_position(self.same_position)
-        for key, key_unit in (("plate_scale", "arcsec / mm"), ("motion_prior", "mas / yr")):
-            if getattr(self, key) is not None:
-                value = value_in(getattr(self, key), key_unit, key, where=f"data.{key}")
-                object.__setattr__(self, key, value)
-        if self.plate_scale is not None and not 0 < self.plate_scale < np.inf:
-            raise InputError(
-                f"plate_scale is {self.plate_scale}",
-                where="data.plate_scale",
-                do="give a positive number of arcsec per mm",
-            )
-        if self.motion_prior is not None and not 0 < self.motion_prior < np.inf:
-            raise InputError(
-                f"motion_prior is {self.motion_prior}",
-                where="data.motion_prior",
-                do="give a positive number of mas per year",
-            )
+        if self.plate_scale is not None:
+            where = "data.plate_scale"
+            plate_scale = value_in(self.plate_scale, "arcsec / mm", "plate_scale", where=where)
+            if not 0 < plate_scale < np.inf:
+                raise InputError(
+                    f"plate_scale is {plate_scale}",
+                    where=where,
+                    do="give a positive number of arcsec per mm",
+                )
+            object.__setattr__(self, "plate_scale", plate_scale)
+        if self.motion_prior is not None:
+            motion_prior = prior_in_mas(self.motion_prior, "data.motion_prior")
+            object.__setattr__(self, "motion_prior", motion_prior)
         if self.motion_prior is not None and not self.read_sigma:
             raise InputError(
                 f"motion_prior is given, and sigma is {self.sigma!r}, which does not grow with the "

@@ -7,10 +7,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import numpy as np
+from astropy.coordinates import angular_separation
 
 from bayesdist.app.config.products import ReleaseBlock
 from bayesdist.data.matching.reports import check_campaign
 from bayesdist.data.preparing import refuse_strangers
+from bayesdist.data.sky import mean_direction
 from bayesdist.errors import ConfigError, DegenerateError, InputError
 from bayesdist.kinds.campaign.inputs import Inputs
 from bayesdist.kinds.campaign.reference import rehearse_references
@@ -112,10 +114,9 @@ def distance_of_pointings(ra: Float, dec: Float) -> float:
     known = np.isfinite(ra) & np.isfinite(dec)
     if not known.any():
         return 0.0
-    a, d = np.radians(ra[known]), np.radians(dec[known])
-    xyz = np.stack([np.cos(d) * np.cos(a), np.cos(d) * np.sin(a), np.sin(d)], axis=1)
-    chord = float(np.linalg.norm(xyz - xyz.mean(axis=0), axis=1).max())
-    return float(np.degrees(2.0 * np.arcsin(min(chord / 2.0, 1.0))))
+    mean = np.radians(mean_direction(ra[known], dec[known]))
+    apart = angular_separation(*mean, np.radians(ra[known]), np.radians(dec[known]))
+    return float(np.degrees(apart.max()))
 
 
 def _unlogged(names: tuple[str, ...], log: str) -> str:

@@ -84,11 +84,12 @@ def _lines(run: Run) -> Iterator[str]:
             yield f"geometry     {chip.mirrored}"
     yield _cost(run)
     idle = idle_dates(config, config.requirements())
-    stated = {check.sentence for check in run.checks}
+    checks = run.checks
+    stated = {check.sentence for check in checks}
     for text in (
         *(text for text in doubts_on_run(run) if text not in stated),
         *(text for chip in chips for text in chip.warnings),
-        *warnings_of(run.checks),
+        *warnings_of(checks),
         *([idle] if idle else []),
     ):
         yield f"WARNING      {text}"
