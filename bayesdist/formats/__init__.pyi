@@ -15,11 +15,11 @@ from .idctab.table import (
     read_idctab as read_idctab,
     write_idctab as write_idctab,
 )
-from .lookup.d2im import (
+from .lookup.tables import (
     read_d2im as read_d2im,
     write_d2im as write_d2im,
 )
-from .lookup.npol import (
+from .lookup.tables import (
     read_npol as read_npol,
     write_npol as write_npol,
 )

@@ -2,8 +2,8 @@
 
 from bayesdist.plugin import Plugin
 
-_PACKAGES = "ast cpdis idctab lookup siaf sip stdgdc tpv".split()
-_MODULES = "gbdes jwst parameters roman wcs".split()
+_PACKAGES = "idctab lookup siaf sip".split()
+_MODULES = "ast cpdis gbdes jwst parameters roman stdgdc tpv wcs".split()
 
 PLUGIN = Plugin(
     formats={

@@ -17,7 +17,7 @@ from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.calibration.calibration import GaussianSolution, calibration_of
 from bayesdist.calibration.plane import Plane
 from bayesdist.formats.sip.build import sip_from_solution
-from bayesdist.formats.sip.calibration import sip_positions
+from bayesdist.formats.sip.format import sip_positions
 from bayesdist.missions.wise.meta_data.build import write_wise_meta
 from bayesdist.missions.wise.meta_data.meta import read_wise_meta
 from bayesdist.model import Chip, DistortionModel

@@ -19,7 +19,7 @@ from astropy.table import Table, vstack
 from astropy.wcs import WCS, FITSFixedWarning, Sip
 from astropy.wcs.utils import fit_wcs_from_points
 
-from bayesdist.formats.tpv.head import tpv_of
+from bayesdist.formats.tpv import tpv_of
 from bayesdist.products import read_calibration
 from bayesdist.products.common.content import read_content
 from tests.app.support import EXACT, good, partly_run, summary_of, write_config, write_job

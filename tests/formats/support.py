@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from bayesdist.calibration.calibration import Calibration, calibration_of
 from bayesdist.calibration.orientation import lay_on, oriented
 from bayesdist.calibration.plane import Orientation, Plane
-from bayesdist.formats.idctab.calibration import idctab_calibration
+from bayesdist.formats.idctab.format import idctab_calibration
 from bayesdist.formats.idctab.table import IdcTab
 from bayesdist.infer import Solution
 from bayesdist.model import Chip, DistortionModel, TimeDependence

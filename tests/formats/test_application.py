@@ -22,7 +22,7 @@ from bayesdist.calibration.calibration import calibration_of
 from bayesdist.calibration.inverse import fitted_inverse
 from bayesdist.errors import FormatError, InputError
 from bayesdist.formats.idctab.build import idctab_from_solution
-from bayesdist.formats.idctab.calibration import idctab_calibration
+from bayesdist.formats.idctab.format import idctab_calibration
 
 from .acs_offline import Pointing, corrected, to_sky
 from .siaf_acs import ZERO, siaf_calibration

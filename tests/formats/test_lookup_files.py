@@ -13,10 +13,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 from bayesdist.errors import BayesdistError, DegenerateError, FormatError, InputError
 from bayesdist.formats.idctab.build import idctab_from_solution
 from bayesdist.formats.idctab.table import IdcTab
-from bayesdist.formats.lookup.d2im import read_d2im, write_d2im
 from bayesdist.formats.lookup.file import LookupFile, read_lookup_file, write_lookup_file
 from bayesdist.formats.lookup.format import lint_lookup_file
-from bayesdist.formats.lookup.npol import read_npol, write_npol
+from bayesdist.formats.lookup.tables import read_d2im, read_npol, write_d2im, write_npol
 from bayesdist.model.lookup import LookupTable
 from bayesdist.products import describe
 from bayesdist.products.common.content import read_content

@@ -17,9 +17,8 @@ from numpy.testing import assert_allclose
 
 from bayesdist.formats.idctab.build import idctab_from_solution
 from bayesdist.formats.idctab.table import IdcTab, read_idctab, write_idctab
-from bayesdist.formats.lookup.d2im import read_d2im, write_d2im
 from bayesdist.formats.lookup.file import LookupFile, write_lookup_file
-from bayesdist.formats.lookup.npol import read_npol, write_npol
+from bayesdist.formats.lookup.tables import read_d2im, read_npol, write_d2im, write_npol
 from bayesdist.model.lookup import LookupTable, corrected
 from tests.reduced import case_in_full
 

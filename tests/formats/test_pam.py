@@ -12,7 +12,7 @@ from bayesdist.calibration.apply import Subarray, subarray_at_corner
 from bayesdist.calibration.area import pixel_area_map, pixel_areas
 from bayesdist.calibration.calibration import calibration_of
 from bayesdist.errors import InputError
-from bayesdist.formats.idctab.calibration import idctab_calibration
+from bayesdist.formats.idctab.format import idctab_calibration
 from bayesdist.formats.idctab.table import read_idctab
 from bayesdist.products.maps_file import write_pam
 

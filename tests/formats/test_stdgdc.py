@@ -15,7 +15,7 @@ from bayesdist.calibration.area import pixel_areas
 from bayesdist.calibration.calibration import Calibration, calibration_of
 from bayesdist.calibration.chip_map import ChipMap
 from bayesdist.errors import FormatError, InputError
-from bayesdist.formats.stdgdc.file import EXTENSIONS, CorrectedFrame, stdgdc_of
+from bayesdist.formats.stdgdc import EXTENSIONS, CorrectedFrame, stdgdc_of
 from bayesdist.model import LookupTable
 from bayesdist.products import registry
 from bayesdist.products.common.content import read_content

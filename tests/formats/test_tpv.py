@@ -14,7 +14,7 @@ from numpy.testing import assert_allclose
 
 from bayesdist.calibration.calibration import calibration_of
 from bayesdist.errors import FormatError, InputError
-from bayesdist.formats.tpv.head import tpv_of
+from bayesdist.formats.tpv import tpv_of
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 from bayesdist.products import registry
 from bayesdist.products.common.content import read_content

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.formats.lookup.d2im import write_d2im
+from bayesdist.formats.lookup.tables import write_d2im
 from bayesdist.missions.wise.simulate.bringup import simulate_unpaired
 from bayesdist.products import registry
 from tests.app import layouts

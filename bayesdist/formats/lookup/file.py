@@ -2,22 +2,27 @@
 
 The files have image extensions DX and DY for each chip, identified by CCDCHIP. Node k (from 1) of
 axis a is at pixel CRVALa + (k - CRPIXa) CDELTa. Without CRPIX and CRVAL both are taken as 0, so
-that the first node is at pixel CDELT (astropy 6.1 and later; at pixel 1 before).
+that the first node is at pixel CDELT (astropy 6.1 and later; at pixel 1 before). `lookup_file`
+always writes CRPIX, CRVAL and CDELT.
 
 Files written by bayesdist have further content, which other programs ignore:
 
 SIGMA_DX, SIGMA_DY
     Image extensions of the same shape with the standard error of each node.
 BDPAD
-    Number of columns at the right end that are padding (see
-    `bayesdist.formats.lookup.build`).
+    Number of columns at the right end that are padding. stwcs records the maximum of a table, not
+    of its absolute value, as the size of the correction, and astropy.wcs ignores a table with a
+    negative maximum. If no node is clearly positive, columns are therefore appended at the right
+    end: copies of the last column up to the edge of the detector, so that nothing changes there,
+    and then one positive column that no pixel reaches.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -25,9 +30,16 @@ from astropy.io import fits
 
 from bayesdist.errors import FormatError, InputError
 from bayesdist.model.lookup import LookupTable
-from bayesdist.products.common.cards import named_in
-from bayesdist.products.common.content import Hdu, read_hdus, write_hdus
-from bayesdist.products.common.lookup_plane import Plane
+from bayesdist.products.common.cards import (
+    append_cards,
+    named_in,
+    node_cards,
+    number_card,
+    text_card,
+    wrapped_cards,
+)
+from bayesdist.products.common.content import Hdu, hdus_of, read_hdus, write_hdus
+from bayesdist.products.common.lookup_plane import TablePlane
 from bayesdist.utils.arrays import Float
 
 AXES = ("DX", "DY")
@@ -94,22 +106,22 @@ class LookupFile:
         return tuple(named_in(self.header, k, self.name) for k in _FILTERS if k in self.header)
 
     @cached_property
-    def planes(self) -> tuple[Plane, ...]:
+    def planes(self) -> tuple[TablePlane, ...]:
         """Extensions DX and DY, in the order of the file."""
         return self._planes(AXES)
 
     @cached_property
-    def sigma_planes(self) -> tuple[Plane, ...]:
+    def sigma_planes(self) -> tuple[TablePlane, ...]:
         """Extensions SIGMA_DX and SIGMA_DY."""
         return self._planes(tuple(_SIGMA + a for a in AXES))
 
-    def _planes(self, names: tuple[str, ...]) -> tuple[Plane, ...]:
+    def _planes(self, names: tuple[str, ...]) -> tuple[TablePlane, ...]:
         out = []
         for number, hdu in enumerate(self.hdus[1:], start=1):
             header, name = hdu.header, hdu.name
             image = str(header.get("XTENSION", "")).strip() == "IMAGE" and header["NAXIS"] == 2
             if name in names and image and hdu.data:
-                out.append(Plane(hdu, name, f"{self.name}, HDU {number} ({name})"))
+                out.append(TablePlane(hdu, name, f"{self.name}, HDU {number} ({name})"))
         return tuple(out)
 
     @property
@@ -117,7 +129,7 @@ class LookupFile:
         """Chip numbers, in the order of the file."""
         return tuple(dict.fromkeys(p.chip for p in self.planes))
 
-    def pair(self, chip: int) -> tuple[Plane, Plane]:
+    def pair(self, chip: int) -> tuple[TablePlane, TablePlane]:
         """Extensions DX and DY of a chip.
 
         FormatError if one is missing or repeated, or if their grids differ.
@@ -131,7 +143,7 @@ class LookupFile:
             )
         return x, y
 
-    def _one(self, chip: int, axis: str) -> Plane:
+    def _one(self, chip: int, axis: str) -> TablePlane:
         matching = [p for p in self.planes if p.chip == chip and p.name == axis]
         if len(matching) != 1:
             raise FormatError(
@@ -240,3 +252,117 @@ def check_kind(file: LookupFile, kind: str) -> None:
             where=file.name,
             do=f"read it with read_{file.kind}",
         )
+
+
+# Fraction of the largest absolute value; a smaller maximum may become negative in processing.
+_CLEARLY = 0.01
+
+
+def one_per_chip(tables: Sequence[LookupTable], where: str) -> list[LookupTable]:
+    """Tables in the order of the file: the highest chip first, so that EXTVER 1 is chip 2 of ACS.
+
+    InputError if there is no table, or if two tables are for the same chip.
+    """
+    if not tables:
+        raise InputError("no look-up table is given", where=where, do="give one for each chip")
+    chip, count = Counter(t.chip for t in tables).most_common(1)[0]
+    if count > 1:
+        raise InputError(
+            f"{count} look-up tables of chip {chip}", where=where, do="give one for each chip"
+        )
+    return sorted(tables, key=lambda table: -table.chip)
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """Tables of one chip; the reading program applies `turn` (2, 2) before it takes maxima."""
+
+    table: LookupTable  # defines chip and grid
+    values: Float  # (2, ny, nx)
+    sigma: Float | None  # (2, ny, nx)
+    turn: Float = field(default_factory=lambda: np.eye(2))
+
+    def padding(self, columns: int) -> Float:
+        """Columns to append for a chip with this many columns, shape (2, ny, n); n is often 0."""
+        transformed = np.einsum("ab,byx->ayx", self.turn, self.values)
+        largest = np.abs(transformed).max(axis=(1, 2))
+        if not (transformed.max(axis=(1, 2)) < _CLEARLY * largest).any():
+            return self.values[..., :0]
+        last = self.table.nodes()[0][-1]
+        # half a step beyond the detector, because the pixel may already have been shifted
+        copies = int(np.ceil((columns + 0.5 - last) / self.table.step[0] + 0.5))
+        beyond = np.linalg.solve(self.turn, np.full(2, largest.max()))
+        column = np.broadcast_to(beyond[:, None, None], (*self.values.shape[:2], 1))
+        copied = np.repeat(self.values[..., -1:], max(copies, 1), axis=-1)
+        return np.concatenate([copied, column], axis=-1)
+
+
+def lookup_file(
+    parts: Sequence[Part], *, size: tuple[int, int], cards: Sequence[str], name: str
+) -> LookupFile:
+    """File of all parts, in the order of EXTVER.
+
+    `size` is the number of columns and rows of a chip, `cards` are added to the primary header, and
+    `name` is for error messages.
+    """
+    primary = fits.PrimaryHDU()
+    append_cards(primary, cards)
+    hdus, sigmas = [primary], []
+    for version, part in enumerate(parts, start=1):
+        extra = part.padding(size[0])
+        for axis, name_of_axis in enumerate(AXES):
+            place = _place_cards(part.table, version, size)
+            if n := extra.shape[-1]:
+                place.append(number_card("BDPAD", n, "columns at the end that are no nodes"))
+            plane = np.concatenate([part.values[axis], extra[axis]], axis=-1)
+            hdus.append(_image(name_of_axis, plane, place))
+            if part.sigma is not None:
+                place = _place_cards(part.table, version, size)
+                sigmas.append(_image(f"SIGMA_{name_of_axis}", part.sigma[axis], place))
+    # after the tables: stwcs searches the extensions in order until it finds a table
+    return LookupFile(hdus_of([*hdus, *sigmas]), name)
+
+
+def _image(name: str, plane: Float, cards: Sequence[str]) -> fits.ImageHDU:
+    hdu = fits.ImageHDU(np.asarray(plane, np.float32))
+    append_cards(hdu, [text_card("EXTNAME", name), *cards])
+    return hdu
+
+
+def _place_cards(table: LookupTable, version: int, size: tuple[int, int]) -> list[str]:
+    """Cards that register a table on the detector."""
+    return [
+        number_card("EXTVER", version),
+        number_card("CCDCHIP", table.chip, "chip of the table"),
+        number_card("ONAXIS1", int(size[0]), "columns of the chip"),
+        number_card("ONAXIS2", int(size[1]), "rows of the chip"),
+        *node_cards(table),
+        text_card("BUNIT", "pixel"),
+    ]
+
+
+def reference_cards(
+    instrument: str,
+    detector: str,
+    filetype: str,
+    description: str,
+    filters: Mapping[str, str],
+    useafter: str | None,
+    pedigree: str | None,
+    history: Sequence[str],
+) -> list[str]:
+    """Header cards of a reference file; values that only the user knows come last."""
+    texts = {
+        "TELESCOP": "HST",
+        "INSTRUME": instrument,
+        "DETECTOR": detector,
+        "FILETYPE": filetype,
+        "OBSTYPE": "IMAGING",
+        "DESCRIP": description,
+        "CREATOR": "bayesdist",
+        **filters,
+    }
+    user_values = {"USEAFTER": useafter, "PEDIGREE": pedigree}
+    texts |= {keyword: text for keyword, text in user_values.items() if text}
+    cards = [text_card(keyword, text) for keyword, text in texts.items()]
+    return cards + wrapped_cards("HISTORY", history)

@@ -17,7 +17,7 @@ from bayesdist.products.common.document import (
     finding_lines,
     identity_lines,
 )
-from bayesdist.products.common.lookup_plane import Plane
+from bayesdist.products.common.lookup_plane import TablePlane
 from bayesdist.products.common.rules import (
     IDENTITY,
     Missing,
@@ -132,7 +132,7 @@ def _header(file: LookupFile) -> Iterator[Finding]:
 
 def _registration(file: LookupFile) -> Iterator[Finding]:
     """Findings on node positions, one per group of extensions with the same missing keywords."""
-    groups: dict[tuple[str, ...], list[Plane]] = {}
+    groups: dict[tuple[str, ...], list[TablePlane]] = {}
     for plane in file.planes:
         groups.setdefault(plane.missing, []).append(plane)
     for absent, planes in groups.items():
@@ -161,7 +161,7 @@ def _registration(file: LookupFile) -> Iterator[Finding]:
         yield from _cover(plane)
 
 
-def _cover(plane: Plane) -> Iterator[Finding]:
+def _cover(plane: TablePlane) -> Iterator[Finding]:
     """Findings on tables that end more than a step inside an edge and are constant beyond."""
     sizes = [plane.number(f"ONAXIS{a}", 0) for a in (1, 2)]
     for axis, (n, first, step, size) in enumerate(
@@ -263,7 +263,7 @@ def _sigma(file: LookupFile) -> Iterator[Finding]:
             yield Finding("warning", f"chip {chip}", text)
 
 
-def _names(planes: list[Plane]) -> str:
+def _names(planes: list[TablePlane]) -> str:
     """Names of extensions, such as "DX,1"."""
     return ", ".join(f"{p.name},{p.version}" for p in planes)
 

@@ -22,9 +22,8 @@ from bayesdist.files.atomic import made_folder, refuse_unsafe_name
 from bayesdist.formats.idctab.build import idctab_from_solution
 from bayesdist.formats.idctab.drift import Loss, storable
 from bayesdist.formats.idctab.table import IdcTab, combination_of, read_idctab, write_idctab
-from bayesdist.formats.lookup.d2im import read_d2im, write_d2im
 from bayesdist.formats.lookup.file import read_lookup_file
-from bayesdist.formats.lookup.npol import write_npol
+from bayesdist.formats.lookup.tables import read_d2im, write_d2im, write_npol
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.infer.solution.transforms import reference_gauge, without_frames
 from bayesdist.model.lookup import LookupTable

@@ -14,7 +14,7 @@ from bayesdist.utils.arrays import Float
 
 
 @dataclass(frozen=True, eq=False)
-class Plane:
+class TablePlane:
     """Image extension with the shifts along one axis of one chip, or their standard errors."""
 
     hdu: Hdu

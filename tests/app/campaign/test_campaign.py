@@ -18,7 +18,7 @@ from bayesdist.app.run import Run
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data import read_exposures, read_matches
 from bayesdist.formats.idctab.table import read_idctab
-from bayesdist.formats.lookup.d2im import read_d2im
+from bayesdist.formats.lookup.tables import read_d2im
 from bayesdist.infer import load_posterior
 from bayesdist.infer.nodes import NodeGrid
 from bayesdist.infer.solution.transforms import reference_gauge, segment, without_frames

@@ -22,8 +22,8 @@ from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.data import read_exposures
 from bayesdist.errors import InputError
 from bayesdist.formats.idctab.table import read_idctab
-from bayesdist.formats.lookup.d2im import read_d2im
 from bayesdist.formats.lookup.file import read_lookup_file
+from bayesdist.formats.lookup.tables import read_d2im
 from bayesdist.infer import load_fit, load_posterior
 from bayesdist.infer.exposures.shared_drift import drift_priors, with_drift_of
 from bayesdist.infer.nodes.fit import held_sigma

@@ -11,7 +11,7 @@ from astropy.table import Table
 from numpy.testing import assert_allclose
 
 from bayesdist.formats.idctab.build import idctab_from_solution
-from bayesdist.formats.idctab.calibration import idctab_calibration
+from bayesdist.formats.idctab.format import idctab_calibration
 from bayesdist.formats.idctab.table import read_idctab, write_idctab
 from bayesdist.infer import fit_linear, save_fit
 from bayesdist.model import Chip, DistortionModel

@@ -8,7 +8,7 @@ from matplotlib.quiver import Quiver
 from numpy.testing import assert_allclose
 
 from bayesdist.diagnose.residuals.binned import binned_sums
-from bayesdist.formats.idctab.calibration import idctab_calibration
+from bayesdist.formats.idctab.format import idctab_calibration
 from bayesdist.formats.idctab.table import read_idctab
 from bayesdist.missions.hst.handbook.figures import area_figure, non_linear_figure, residual_figure
 from bayesdist.missions.hst.handbook.numbers import detector_numbers, handbook_rows

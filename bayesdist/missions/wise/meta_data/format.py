@@ -11,8 +11,7 @@ from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.plane import Plane
 from bayesdist.errors import InputError
 from bayesdist.formats.sip.build import sip_from_solution
-from bayesdist.formats.sip.calibration import headers_read_back
-from bayesdist.formats.sip.format import coefficient_lines
+from bayesdist.formats.sip.format import coefficient_lines, headers_read_back
 from bayesdist.formats.sip.header import (
     SIP_ORDERS,
     SipHeader,

@@ -11,8 +11,8 @@ from astropy.io import fits
 
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.errors import FormatError, InputError
-from bayesdist.formats.sip.calibration import sip_calibration
 from bayesdist.formats.sip.files import parsed
+from bayesdist.formats.sip.format import sip_calibration
 from bayesdist.formats.sip.header import SipHeader
 from bayesdist.products.common.content import Content, read_content
 

@@ -1,1 +1,0 @@
-"""AST mappings: polynomials as text dumps, as written by starlink-pyast and Rubin."""

@@ -1,1 +1,0 @@
-"""Look-up tables with CPDIS and DP records (FITS WCS Paper IV)."""

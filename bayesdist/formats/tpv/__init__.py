@@ -1,1 +1,0 @@
-"""TPV headers: polynomials of intermediate world coordinates, as written by SCAMP."""
