@@ -6,8 +6,8 @@ delivered, and from the same model turned by 270 degrees.  Every start should en
 
 import numpy as np
 
-from bayesdist.missions.wise.bring_up.iterate import bring_up
-from bayesdist.missions.wise.pairs.radial_limit import RadialLimit
+from bayesdist.missions.wise.bring_up import bring_up
+from bayesdist.missions.wise.pairs.section import RadialLimit
 from bayesdist.missions.wise.simulate.bringup import simulate_unpaired
 from bayesdist.missions.wise.simulate.optical import optical_model
 

@@ -18,8 +18,7 @@ from bayesdist.calibration.calibration import GaussianSolution, calibration_of
 from bayesdist.calibration.plane import Plane
 from bayesdist.formats.sip.build import sip_from_solution
 from bayesdist.formats.sip.format import sip_positions
-from bayesdist.missions.wise.meta_data.build import write_wise_meta
-from bayesdist.missions.wise.meta_data.meta import read_wise_meta
+from bayesdist.missions.wise.meta_data.meta import read_wise_meta, write_wise_meta
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.products.common.document import BuildOptions
 from bayesdist.products.registry import product_settings

@@ -15,7 +15,7 @@ from bayesdist.data import open_matches
 from bayesdist.infer import load_fit
 from bayesdist.kinds.matches import sources
 from bayesdist.missions.wise.pairs.read import read_rvb
-from bayesdist.missions.wise.rvb.transform import RvbTransform
+from bayesdist.missions.wise.rvb import RvbTransform
 from tests.app.rvb_jobs import DETECTORS, rvb_job, rvb_pairs, write_rvb_table
 from tests.app.support import cli, good, partly_run, refused, snapshot, summary_of
 from tests.reduced import only_in_full

@@ -15,8 +15,7 @@ from bayesdist.infer.nodes import TableFit, TablePosterior, fit_with_tables
 from bayesdist.infer.solution.solution import Solution, TransformedSolution
 from bayesdist.infer.solution.transforms import lines, reference_gauge, without_frames
 from bayesdist.kinds.campaign.series import Series, TrendModel, fit_series
-from bayesdist.missions.hst.simulate.pointings import SPANS
-from bayesdist.missions.hst.simulate.stars import centroid_error
+from bayesdist.missions.hst.simulate.truth import SPANS, centroid_error
 from bayesdist.model import corrected
 from tests.campaign.support import (
     CHIPS,

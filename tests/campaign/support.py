@@ -24,7 +24,7 @@ from bayesdist.kinds.campaign import fit as stage
 from bayesdist.kinds.campaign.matched import affine_model_of
 from bayesdist.kinds.campaign.series import Series
 from bayesdist.missions.hst.simulate import AcsCampaign, acs_model, read_acs
-from bayesdist.missions.hst.simulate.pointings import OWN
+from bayesdist.missions.hst.simulate.truth import OWN
 from bayesdist.model import DistortionModel, LookupTable
 from tests.app.support import good
 from tests.infer.small_campaign import with_star_errors

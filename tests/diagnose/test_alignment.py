@@ -26,15 +26,15 @@ from bayesdist.missions.wise.assess.account import (
     contradictions_across,
     contradictions_within,
 )
-from bayesdist.missions.wise.assess.histograms import band_sums
-from bayesdist.missions.wise.assess.published import (
+from bayesdist.missions.wise.assess.distortion_field import band_sums
+from bayesdist.missions.wise.assess.residual_tables import (
     TABLE_5_1,
     TABLE_5_2,
     TABLE_5_3,
     noise_of_bins,
     printed_rows,
+    residual_tables,
 )
-from bayesdist.missions.wise.assess.tables import residual_tables
 from bayesdist.missions.wise.published import SAMPLE_SIZES, WISE_ARCSEC
 from bayesdist.missions.wise.simulate import simulate_wise
 from tests.reduced import only_in_full

@@ -38,7 +38,7 @@ def handbook(line: str, file: str, output: str, **options: Any) -> None:
 
     FILE is an IDCTAB, a run, or any file that 'compare' takes.
     """
-    from bayesdist.missions.hst.handbook.command import handbook as written
+    from bayesdist.missions.hst.geometry import handbook as written
 
     click.echo(written(file, output, command=line, **options))
 
@@ -64,7 +64,7 @@ def pam(file: str, output: str, **options: Any) -> None:
 
     FILE is an IDCTAB, a run, or any file that 'compare' takes.
     """
-    from bayesdist.missions.hst.pam import write_area_maps
+    from bayesdist.missions.hst.geometry import write_area_maps
 
     click.echo(write_area_maps(file, output, **options))
 

@@ -52,7 +52,7 @@ _rotation_of_nothing = Unused(
 @click.pass_obj
 def demo(line: str, output: str, format: str | None, force: bool) -> None:
     """Calibrate simulated data and compare with the truth."""
-    from bayesdist.missions.wise.demo import demo as simulated_and_run
+    from bayesdist.missions.wise.simulated_pairs import demo as simulated_and_run
 
     click.echo(simulated_and_run(output, format=format, force=force, command=line))
 
@@ -120,7 +120,7 @@ def bring_up(line: str, detections: str, reference: str, output: str, **options:
 
     DETECTIONS and REFERENCE have columns x, y, sigma and frame, in pixels of the band.
     """
-    from bayesdist.missions.wise.bring_up.command import bring_up_files
+    from bayesdist.missions.wise.bring_up import bring_up_files
 
     click.echo(bring_up_files(detections, reference, output, command=line, **options))
 
@@ -178,7 +178,7 @@ def transform(files: tuple[str, ...], output: str, **options: Any) -> None:
 
     FILE is an IPAC table, Parquet, or a folder.
     """
-    from bayesdist.missions.wise.rvb.command import transform_files
+    from bayesdist.missions.wise.rvb import transform_files
 
     click.echo(transform_files(files, output, **options))
 
@@ -197,7 +197,7 @@ def transform(files: tuple[str, ...], output: str, **options: Any) -> None:
 )
 def rereference(files: tuple[str, ...], output: str, **options: Any) -> None:
     """Transform the pairs of each frame from one solution to another."""
-    from bayesdist.missions.wise.rvb.command import rereference_files
+    from bayesdist.missions.wise.rvb import rereference_files
 
     click.echo(rereference_files(files, output, **options))
 

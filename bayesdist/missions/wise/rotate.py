@@ -10,8 +10,7 @@ from bayesdist.errors import InputError
 from bayesdist.formats.sip.files import read_sip, write_sip
 from bayesdist.formats.sip.header import SipHeader
 from bayesdist.formats.sip.rotate import rotated_sip
-from bayesdist.missions.wise.meta_data.build import write_wise_meta
-from bayesdist.missions.wise.meta_data.meta import WiseBand, read_wise_meta
+from bayesdist.missions.wise.meta_data.meta import WiseBand, read_wise_meta, write_wise_meta
 from bayesdist.products.registry import open_document
 
 

@@ -14,7 +14,7 @@ from bayesdist.data.starlists import StarCuts
 from bayesdist.errors import InputError
 from bayesdist.missions.hst.simulate import LINEAR_TERMS, acs_solution, simulate_acs
 from bayesdist.missions.hst.simulate.making import cte_shift
-from bayesdist.missions.hst.simulate.stars import centroid_error
+from bayesdist.missions.hst.simulate.truth import centroid_error
 from bayesdist.model.lookup import corrected
 from tests.missions.hst.test_acs_distortion import A_2, B_2, B_3
 from tests.reduced import only_in_full

@@ -10,9 +10,14 @@ from numpy.testing import assert_allclose
 from bayesdist.diagnose.residuals.binned import binned_sums
 from bayesdist.formats.idctab.format import idctab_calibration
 from bayesdist.formats.idctab.table import read_idctab
-from bayesdist.missions.hst.handbook.figures import area_figure, non_linear_figure, residual_figure
-from bayesdist.missions.hst.handbook.numbers import detector_numbers, handbook_rows
-from bayesdist.missions.hst.handbook.whole_detector import WholeDetector
+from bayesdist.missions.hst.geometry import (
+    area_figure,
+    detector_numbers,
+    handbook_rows,
+    non_linear_figure,
+    residual_figure,
+)
+from bayesdist.missions.hst.whole_detector import WholeDetector
 from tests.formats.siaf_acs import SCALE, siaf_calibration
 
 

@@ -8,8 +8,8 @@ from numpy.testing import assert_allclose
 
 from bayesdist.calibration.chip_map import fitted_map
 from bayesdist.errors import InputError
-from bayesdist.missions.hst.handbook.numbers import detector_numbers
-from bayesdist.missions.hst.handbook.whole_detector import WholeDetector
+from bayesdist.missions.hst.geometry import detector_numbers
+from bayesdist.missions.hst.whole_detector import WholeDetector
 
 SIZE = (400.0, 200.0)
 

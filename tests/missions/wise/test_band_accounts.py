@@ -11,9 +11,8 @@ from scipy.special import ndtri
 from bayesdist.assess import distortion_vectors
 from bayesdist.diagnose.residuals.tables import StatisticsRow
 from bayesdist.missions.wise.assess.account import RowAccount
-from bayesdist.missions.wise.assess.distortion_field import field_of_solution
-from bayesdist.missions.wise.assess.histograms import histogram
-from bayesdist.missions.wise.assess.published import PrintedRow
+from bayesdist.missions.wise.assess.distortion_field import field_of_solution, histogram
+from bayesdist.missions.wise.assess.residual_tables import PrintedRow
 from bayesdist.missions.wise.published import LONGEST_VECTORS, WISE_ARRAYS
 from bayesdist.missions.wise.simulate import wise_solution
 from bayesdist.model import Chip, DistortionModel

@@ -10,17 +10,17 @@ from matplotlib.colors import to_rgb
 from matplotlib.quiver import Quiver
 
 from bayesdist.assess import UncertaintyMap, VectorMap
-from bayesdist.missions.wise.assess.histograms import histogram
-from bayesdist.missions.wise.assess.published import printed_rows
-from bayesdist.missions.wise.bands.curves import CASES, histograms
+from bayesdist.missions.wise.assess.distortion_field import histogram
+from bayesdist.missions.wise.assess.residual_tables import printed_rows
 from bayesdist.missions.wise.bands.figures import (
+    CASES,
     alignment,
     formal_uncertainty,
+    histograms,
     residuals,
     vectors,
 )
-from bayesdist.missions.wise.bands.findings import verdict
-from bayesdist.missions.wise.bands.tables import as_printed
+from bayesdist.missions.wise.bands.findings import as_printed, verdict
 
 
 def page_of(*bands, **more) -> SimpleNamespace:

@@ -13,9 +13,9 @@ from scipy import stats
 from bayesdist.data.detections import Detections
 from bayesdist.data.matching.pairs import mutual_pairs
 from bayesdist.errors import InputError
-from bayesdist.missions.wise.bring_up.iterate import bring_up
-from bayesdist.missions.wise.pairs.radial_limit import RadialLimit
+from bayesdist.missions.wise.bring_up import bring_up
 from bayesdist.missions.wise.pairs.read import read_rvb
+from bayesdist.missions.wise.pairs.section import RadialLimit
 from bayesdist.missions.wise.simulate import wise_solution
 from bayesdist.missions.wise.simulate.bringup import simulate_unpaired
 from bayesdist.missions.wise.simulate.optical import optical_model, write_optical_model

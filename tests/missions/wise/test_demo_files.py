@@ -7,7 +7,7 @@ import pytest
 
 from bayesdist.app.commands.on_files.convert import convert
 from bayesdist.infer import save_fit
-from bayesdist.missions.wise.demo import FILES, SCALES
+from bayesdist.missions.wise.simulated_pairs import FILES, SCALES
 from bayesdist.products.registry import lint, read_calibration
 
 NAMES = {

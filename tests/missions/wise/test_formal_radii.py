@@ -9,7 +9,7 @@ from bayesdist.assess import uncertainty_map
 from bayesdist.data import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer import Rejection, fit_linear
-from bayesdist.missions.wise.assess.published import TABLE_5_1, implied_sigma, printed_rows
+from bayesdist.missions.wise.assess.residual_tables import TABLE_5_1, implied_sigma, printed_rows
 from bayesdist.missions.wise.published import FORMAL_RADII, SAMPLE_SIZES, WISE_BANDS
 from bayesdist.model import Chip, DistortionModel
 

@@ -9,10 +9,9 @@ import pytest
 from bayesdist.data import Matches
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.pairs.read import read_rvb, stream_rvb
-from bayesdist.missions.wise.pairs.run_input import open_rvb
+from bayesdist.missions.wise.pairs.run_input import SelectedPairs, open_rvb
 from bayesdist.missions.wise.pairs.rvb_pairs import RvbPairs, write_rvb
 from bayesdist.missions.wise.pairs.section import RvbBlock
-from bayesdist.missions.wise.pairs.selection import SelectedPairs
 from tests.missions.wise.test_pairs import assert_same, rvb_table, write
 
 SIZE = (1016.0, 1016.0)

@@ -13,11 +13,10 @@ from astropy.time import Time
 
 from bayesdist.data import Matches, open_matches, write_partitioned
 from bayesdist.errors import InputError
-from bayesdist.missions.wise.pairs.radial_limit import RadialLimit
 from bayesdist.missions.wise.pairs.read import read_rvb, rvb_bands, stream_rvb
+from bayesdist.missions.wise.pairs.run_input import SelectedPairs
 from bayesdist.missions.wise.pairs.rvb_pairs import RvbPairs, colour_of
-from bayesdist.missions.wise.pairs.section import RvbBlock
-from bayesdist.missions.wise.pairs.selection import SelectedPairs
+from bayesdist.missions.wise.pairs.section import RadialLimit, RvbBlock
 
 SIZE = (1016.0, 1016.0)
 BANDS = ("W1", "W2", "W4")

@@ -12,8 +12,7 @@ import pytest
 from bayesdist.assess import distortion_vectors
 from bayesdist.formats.sip.build import sip_from_solution
 from bayesdist.infer import Rejection, fit_linear
-from bayesdist.missions.wise.meta_data.build import write_wise_meta
-from bayesdist.missions.wise.meta_data.meta import read_wise_meta
+from bayesdist.missions.wise.meta_data.meta import read_wise_meta, write_wise_meta
 from bayesdist.missions.wise.published import LONGEST_VECTORS, WISE_BANDS
 from bayesdist.missions.wise.simulate import wise_set
 from bayesdist.products.common.coefficients import evaluate

@@ -9,8 +9,7 @@ from scipy.stats import chi2, kstest
 
 from bayesdist.diagnose.residuals.binned import BinnedResiduals
 from bayesdist.errors import DegenerateError, InputError
-from bayesdist.missions.wise.assess.residual_correlation import residual_correlation
-from bayesdist.missions.wise.assess.residual_structure import residual_partition
+from bayesdist.missions.wise.assess.residual_field import residual_correlation, residual_partition
 from bayesdist.model.basis import polynomial_terms
 from tests.reduced import case_in_full
 

@@ -15,8 +15,8 @@ from bayesdist.diagnose.periods import pattern_changes
 from bayesdist.diagnose.residuals.binned import band_bins
 from bayesdist.diagnose.residuals.tables import period_table
 from bayesdist.infer import Rejection, fit_linear, load
-from bayesdist.missions.wise.assess.histograms import band_sums
-from bayesdist.missions.wise.assess.tables import residual_tables
+from bayesdist.missions.wise.assess.distortion_field import band_sums
+from bayesdist.missions.wise.assess.residual_tables import residual_tables
 from bayesdist.missions.wise.published import RESIDUAL_SIGMAS, WISE_ARCSEC, WISE_BANDS
 from bayesdist.missions.wise.simulate import wise_set
 

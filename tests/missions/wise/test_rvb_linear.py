@@ -11,13 +11,16 @@ from scipy.optimize import least_squares
 
 from bayesdist.data import Matches
 from bayesdist.errors import DegenerateError, InputError
-from bayesdist.missions.wise.rvb.command import read_solutions
-from bayesdist.missions.wise.rvb.linear import (
+from bayesdist.missions.wise.rvb import (
+    PARAMETERS,
     LinearMoments,
+    RvbTransform,
     fit_transform,
     linear_moments,
+    read_solutions,
+    rereference,
+    transformed,
 )
-from bayesdist.missions.wise.rvb.transform import PARAMETERS, RvbTransform, rereference, transformed
 
 CENTRE = (508.5, 508.5)
 POINTS = np.random.default_rng(1).uniform(0.5, 1016.5, (40, 2))

@@ -14,7 +14,7 @@ from bayesdist.app.commands.on_runs.check import check
 from bayesdist.data import read_matches
 from bayesdist.errors import InputError
 from bayesdist.infer import Rejection, fit_linear
-from bayesdist.missions.wise.assess.published import TABLE_5_1, printed_rows
+from bayesdist.missions.wise.assess.residual_tables import TABLE_5_1, printed_rows
 from bayesdist.missions.wise.published import (
     RESIDUAL_SIGMAS,
     SAMPLE_SIZES,

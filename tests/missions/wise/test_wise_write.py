@@ -17,9 +17,8 @@ from bayesdist.errors import FormatError, InputError
 from bayesdist.formats.sip.build import sip_from_solution
 from bayesdist.formats.sip.files import read_sip, sip_header, write_sip
 from bayesdist.infer import fit_linear
-from bayesdist.missions.wise.meta_data.build import write_wise_meta
 from bayesdist.missions.wise.meta_data.format import lint_wise_band
-from bayesdist.missions.wise.meta_data.meta import read_wise_meta
+from bayesdist.missions.wise.meta_data.meta import read_wise_meta, write_wise_meta
 from bayesdist.missions.wise.published import WISE_COEFFICIENTS
 from bayesdist.missions.wise.simulate import wise_set, wise_solution
 from bayesdist.products import describe

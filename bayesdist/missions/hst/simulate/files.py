@@ -18,13 +18,13 @@ from bayesdist.errors import InputError
 from bayesdist.files.atomic import atomic_path, made_folder
 from bayesdist.files.faults import naming_faults
 from bayesdist.files.tables import read_table
-from bayesdist.missions.hst.simulate.pointings import AcsFrames
-from bayesdist.missions.hst.simulate.stars import TrueStars
 from bayesdist.missions.hst.simulate.truth import (
     LINEAR_TERMS,
     AcsCampaign,
+    AcsFrames,
     AcsTruth,
     DetectionTruth,
+    TrueStars,
 )
 from bayesdist.model import DistortionModel
 from bayesdist.model.grid import mesh

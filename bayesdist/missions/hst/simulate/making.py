@@ -22,14 +22,17 @@ from bayesdist.missions.hst.simulate.distortion import (
     HALF,
     acs_solution,
 )
-from bayesdist.missions.hst.simulate.pointings import exposures_of, frames_of
-from bayesdist.missions.hst.simulate.stars import (
+from bayesdist.missions.hst.simulate.truth import (
     FAINT,
+    AcsCampaign,
+    AcsTruth,
+    DetectionTruth,
     centroid_error,
+    exposures_of,
+    frames_of,
     measured_catalogs,
     true_stars,
 )
-from bayesdist.missions.hst.simulate.truth import AcsCampaign, AcsTruth, DetectionTruth
 from bayesdist.model import Chip, PolynomialBasis
 from bayesdist.model.grid import mesh
 from bayesdist.model.lookup import LookupTable

@@ -15,7 +15,8 @@ from itertools import pairwise
 import numpy as np
 
 from bayesdist.diagnose.residuals.tables import StatisticsRow, StatisticsTable
-from bayesdist.missions.wise.assess.published import (
+from bayesdist.missions.wise.assess.residual_field import ResidualPartition
+from bayesdist.missions.wise.assess.residual_tables import (
     TABLE_5_1,
     TABLE_5_2,
     TABLE_5_3,
@@ -23,7 +24,6 @@ from bayesdist.missions.wise.assess.published import (
     noise_of_bins,
     printed_rows,
 )
-from bayesdist.missions.wise.assess.residual_structure import ResidualPartition
 from bayesdist.missions.wise.published import SAMPLE_SIZES, WISE_ARCSEC
 
 PRINTED_BINS = 31

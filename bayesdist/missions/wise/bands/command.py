@@ -1,42 +1,39 @@
-"""`bayesdist wise bands`: write tables, figures and a page that compare finished runs."""
+"""`bayesdist wise bands`: write tables, figures and a page that compare finished runs.
+
+For scripts there are bands.json and the residual tables as ECSV files.
+"""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import asdict
 from pathlib import Path
+from typing import TypedDict
+
+import numpy as np
+from astropy.table import Table
 
 from bayesdist.app.screen import table_text
-from bayesdist.app.store.output import record_folder
+from bayesdist.app.store.output import record_folder, write_table
 from bayesdist.app.store.record import write_text
 from bayesdist.errors import InputError
 from bayesdist.formats.sip.build import sip_from_solution
+from bayesdist.missions.wise.assess.account import RowAccount
+from bayesdist.missions.wise.assess.distortion_field import ResidualHistogram
+from bayesdist.missions.wise.assess.residual_tables import HEADS
 
 # importing these modules registers their tables and figures
-from bayesdist.missions.wise.bands import curves, figures, findings, tables  # noqa: F401
-from bayesdist.missions.wise.bands.context import BANDS, BandsInput
+from bayesdist.missions.wise.bands import figures, findings  # noqa: F401
+from bayesdist.missions.wise.bands.context import BANDS, BandResult, BandsInput
 from bayesdist.missions.wise.bands.findings import overview_table, verdict
-from bayesdist.missions.wise.bands.inputs import BandRun, open_bands
-from bayesdist.missions.wise.bands.measure import measure_bands
+from bayesdist.missions.wise.bands.measure import BandRun, measure_bands, open_bands
 from bayesdist.missions.wise.bands.optical import optical_models
-from bayesdist.missions.wise.bands.record import record_of, write_tables
-from bayesdist.missions.wise.meta_data.build import write_wise_meta
+from bayesdist.missions.wise.meta_data.meta import write_wise_meta
 from bayesdist.missions.wise.published import WISE_BANDS
 from bayesdist.report.drawing import draw_all, save_drawings
 from bayesdist.report.page import parts_of, template
-
-
-def _page(inputs: BandsInput, folder: Path) -> list[str]:
-    """Write bands.html and its figures to a folder; returns their names."""
-    drawings = draw_all(BANDS, inputs, pdf=True)
-    paths = save_drawings(drawings, folder / "figures")
-    overview, *parts = parts_of(BANDS, inputs, drawings)
-    page = template("bands.html.jinja", __package__)
-    text = page.render(run=inputs, overview=overview, parts=parts, verdict=findings.verdict(inputs))
-    write_text(folder / "bands.html", text)
-    return ["bands.html", *(f"figures/{path.name}" for path in paths)]
-
 
 log = logging.getLogger("bayesdist")
 
@@ -107,6 +104,17 @@ def _meta(bands: Mapping[str, BandRun], folder: Path) -> list[str]:
     return ["wise_meta.tbl"]
 
 
+def _page(inputs: BandsInput, folder: Path) -> list[str]:
+    """Write bands.html and its figures to a folder; returns their names."""
+    drawings = draw_all(BANDS, inputs, pdf=True)
+    paths = save_drawings(drawings, folder / "figures")
+    overview, *parts = parts_of(BANDS, inputs, drawings)
+    page = template("bands.html.jinja", __package__)
+    text = page.render(run=inputs, overview=overview, parts=parts, verdict=findings.verdict(inputs))
+    write_text(folder / "bands.html", text)
+    return ["bands.html", *(f"figures/{path.name}" for path in paths)]
+
+
 def _text(output: Path, inputs: BandsInput) -> str:
     table = overview_table(inputs)
     lines = [table_text([dict(zip(table.columns, row, strict=False)) for row in table.rows])]
@@ -116,3 +124,181 @@ def _text(output: Path, inputs: BandsInput) -> str:
     ]
     lines += ["", verdict(inputs).headline]
     return "\n".join([*lines, "", f"page: {output / 'bands.html'}"])
+
+
+class BandsRecord(TypedDict):
+    """Content of bands.json, apart from the command and versions."""
+
+    converged: bool
+    verdict: Mapping[str, str]  # level and headline
+    n_bins: int
+    optical: str | None
+    bands: list[Mapping[str, object]]  # in the order of the tables
+    differences: list[Mapping[str, object]]  # of later bands minus the first
+    tables: Mapping[str, Mapping[str, object]]  # unit and rows, by table
+
+
+def record_of(inputs: BandsInput) -> BandsRecord:
+    """Content of bands.json, apart from the command and versions."""
+    result = verdict(inputs)
+    return {
+        "converged": not inputs.provisional,
+        "verdict": {"level": result.level, "headline": result.headline},
+        "n_bins": inputs.n_bins,
+        "optical": inputs.optical or None,
+        "bands": [_band(b) for b in inputs.bands],
+        "differences": [
+            {
+                "name": name,
+                "unit": "pix",
+                "pixels_of": inputs.names[0],
+                "max": v.length_max,
+                "position_of_max": v.position_of_max,
+            }
+            for name, v in inputs.differences.items()
+        ],
+        "tables": {
+            name: {
+                "unit": inputs.tables[name].unit,
+                "rows": [_row(account) for account in row_accounts],
+            }
+            for name, row_accounts in inputs.accounts.items()
+        },
+    }
+
+
+def _band(b: BandResult) -> Mapping[str, object]:
+    c, p = b.correlation, b.partition
+    count = b.sums.bins.count
+    return {
+        "name": b.name,
+        "run": b.path,
+        "converged": b.converged,
+        "reasons": b.reasons,
+        "order": b.order,
+        "arcsec_per_pixel": b.arcsec,
+        "n_pairs": b.n_pairs,
+        "n_used": b.n_used,
+        "vectors": {
+            "unit": "pix",
+            "max": b.vectors.length_max,
+            "position_of_max": b.vectors.position_of_max,
+        },
+        "formal_radius": {
+            "unit": b.formal_map.unit,
+            "least_squares": b.formal_map.radius_max,
+            "posterior": b.posterior_map.radius_max,
+        },
+        "partition": {
+            "blocks": p.k,
+            "p_value": p.p_value,
+            "significant": p.significant,
+            "edges_seen": p.edges_seen,
+            "rms_x": p.rms[0],
+            "rms_y": p.rms[1],
+            "unit": "pix",
+            "sentence": p.sentence,
+        },
+        "correlation": {
+            "unit": "pix2",
+            "p_value": c.p_value,
+            "chi2": c.chi2,
+            "reach": c.reach,
+            "separation": c.separation,
+            "xx": c.uu,
+            "yy": c.vv,
+            "xy": c.uv,
+            "sigma_xx": c.sigma_uu,
+            "sigma_yy": c.sigma_vv,
+            "sigma_xy": c.sigma_uv,
+        },
+        "histograms": {case: _histogram(h) for case, h in b.sums.histograms.items()},
+        "coverage": {
+            "expected": count.mean(),
+            "poisson_error": np.sqrt(count.mean()),
+            "min": count.min(),
+            "max": count.max(),
+            "chi2": b.coverage_chi2,
+            "dof": count.size - 1,
+        },
+        "minus_optical_max": None if b.minus_optical is None else b.minus_optical.length_max,
+        "printed": None if b.printed is None else asdict(b.printed),
+    }
+
+
+def _histogram(h: ResidualHistogram) -> Mapping[str, object]:
+    return {
+        "unit": "pix",
+        "reach": h.reach,
+        "n": h.n,
+        "outside_x": h.outside[0],
+        "outside_y": h.outside[1],
+        "half_width_x": h.half_width()[0],
+        "half_width_y": h.half_width()[1],
+        "counts_x": h.counts[0],
+        "counts_y": h.counts[1],
+    }
+
+
+def _row(one: RowAccount) -> Mapping[str, object]:
+    row = one.row
+    out: dict[str, object] = {
+        "label": row.label,
+        "value": row.value,
+        "error": row.error,
+        "noise_free": row.noise_free,
+        "sigma_noise": row.sigma_noise,
+        "sigma_partition": one.partition,
+        "sigma_rest": one.rest,
+        "n_bins": row.n_bins,
+    }
+    if one.printed is not None:
+        out |= {
+            "printed": one.printed.value,
+            "printed_noise": one.printed_noise,
+            "printed_structure": one.printed_structure,
+            "printed_more": one.remains,
+            "verdict": one.verdict,
+            "account": one.sentence,
+            "contradictions": one.contradictions,
+        }
+    return out
+
+
+def write_tables(inputs: BandsInput, folder: Path) -> tuple[str, ...]:
+    """Write the residual tables as table_5_1.ecsv etc.; returns their names.
+
+    Raises InputError if a file cannot be written.
+    """
+    names = []
+    for name, table in inputs.tables.items():
+        out = table.to_table(errors=True)
+        accounts = inputs.accounts[name]
+        _add(out, "Sigma partition", [account.partition for account in accounts], table.unit)
+        _add(out, "Sigma rest", [account.rest for account in accounts], table.unit)
+        if any(account.printed is not None for account in accounts):
+            for statistic, head in HEADS.items():
+                values = [
+                    None if account.printed is None else account.printed.value[statistic]
+                    for account in accounts
+                ]
+                _add(out, f"{head} printed", values, table.unit)
+            for k, limit in enumerate(("least", "most")):
+                values = [
+                    None if account.printed_noise is None else account.printed_noise[k]
+                    for account in accounts
+                ]
+                _add(out, f"Sigma printed noise, {limit}", values, table.unit)
+            _add(out, "Sigma printed more", [account.remains for account in accounts], table.unit)
+            out["Account"] = [account.sentence for account in accounts]
+            out["Contradictions"] = [" ".join(account.contradictions) for account in accounts]
+        out.meta |= {"converged": not inputs.provisional, "bins": inputs.n_bins}
+        path = f"table_{name.replace('-', '_')}.ecsv"
+        write_table(out, folder / path)
+        names.append(path)
+    return tuple(names)
+
+
+def _add(table: Table, name: str, values: list[float | None], unit: str) -> None:
+    table[name] = np.array([np.nan if v is None else v for v in values], float)
+    table[name].unit = unit

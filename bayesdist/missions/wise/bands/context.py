@@ -12,9 +12,8 @@ if TYPE_CHECKING:
     from bayesdist.assess import UncertaintyMap, VectorMap
     from bayesdist.diagnose.residuals.tables import StatisticsTable
     from bayesdist.missions.wise.assess.account import RowAccount
-    from bayesdist.missions.wise.assess.histograms import BandSums
-    from bayesdist.missions.wise.assess.residual_correlation import ResidualCorrelation
-    from bayesdist.missions.wise.assess.residual_structure import ResidualPartition
+    from bayesdist.missions.wise.assess.distortion_field import BandSums
+    from bayesdist.missions.wise.assess.residual_field import ResidualCorrelation, ResidualPartition
 
 BANDS = Registry(
     "bands",

@@ -23,7 +23,6 @@ from bayesdist.formats.sip.header import (
     worst_closure,
 )
 from bayesdist.formats.sip.lint import lint_sip
-from bayesdist.missions.wise.meta_data.build import wise_text
 from bayesdist.missions.wise.meta_data.implied import (
     StatedMaxima,
     implied_values,
@@ -36,6 +35,7 @@ from bayesdist.missions.wise.meta_data.meta import (
     holds_wise_meta,
     monomial,
     wise_calibration,
+    wise_text,
 )
 from bayesdist.model.basis import polynomial_terms
 from bayesdist.products.common.coefficients import (

@@ -1,13 +1,12 @@
 """Simulated WISE data: pairs of band-frame and 2MASS positions with the published distortion."""
 
 from bayesdist.missions.wise.simulate.files import write_wise_set
-from bayesdist.missions.wise.simulate.sets import PairChunk, WiseSet, wise_set
+from bayesdist.missions.wise.simulate.sets import POPULATIONS, PairChunk, WiseSet, wise_set
 from bayesdist.missions.wise.simulate.solution import (
     simulate_wise,
     simulate_wise_partitioned,
     wise_solution,
 )
-from bayesdist.missions.wise.simulate.stars import POPULATIONS
 
 __all__ = [
     "POPULATIONS",

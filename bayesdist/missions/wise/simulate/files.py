@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from bayesdist.data.storage import Labelled, write_columns
 from bayesdist.errors import InputError
 from bayesdist.files.atomic import atomic_path, made_folder
-from bayesdist.missions.wise.simulate.pattern import PartitionPattern
-from bayesdist.missions.wise.simulate.sets import PairChunk, WiseSet
+from bayesdist.missions.wise.simulate.sets import PairChunk, PartitionPattern, WiseSet
 
 UNITS = dict.fromkeys(("x", "y", "u", "v", "sigma"), "pix") | {"epoch": "yr", "mag": "mag"}
 UNITS["colour"] = "mag"

@@ -1,16 +1,24 @@
-"""Published residual tables of WSDC D-T033, and the implied errors of pairs."""
+"""Tables 5-1, 5-2 and 5-3 of WSDC D-T033 for any bands, and their published values.
+
+All statistics have errors.  The errors of single pairs that the published tables imply are computed
+from their radial rows.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from decimal import Decimal
+from itertools import combinations, product
 
 import numpy as np
 
-from bayesdist.diagnose.residuals.tables import STATISTICS
+from bayesdist.diagnose.residuals.binned import BAND_AXES, BinnedSums
+from bayesdist.diagnose.residuals.tables import STATISTICS, StatisticsTable, bin_row, pair_row
 from bayesdist.errors import InputError
 from bayesdist.model.basis import polynomial_terms
+
+_AXES = BAND_AXES[:2]
 
 HEADS = dict(
     zip(STATISTICS, ("Mean", "Sigma", "Min", "Max", "Median", "1%-tile", "99%-tile"), strict=True)
@@ -57,6 +65,75 @@ W3/Y 0.0 0.03440 -0.2206 0.2206 0.0 -0.0829 0.0829
 W4/X 0.0 0.1811 -0.8310 0.8310 0.0 -0.4249 0.4249
 W4/Y 0.0 0.1764 -0.8766 0.8766 0.0 -0.4102 0.4102
 """
+
+
+def residual_tables(
+    bands: Mapping[str, BinnedSums],
+    *,
+    rng: np.random.Generator,
+    arcsec: Mapping[str, float],
+    absorbed: Mapping[str, int],
+) -> dict[str, StatisticsTable]:
+    """Residual tables '5-1', '5-2' and '5-3' of several bands.
+
+    Table 5-1 has the residuals of the fit in bins, in pixels.  Table 5-2 has the differences of two
+    bands bin by bin, and Table 5-3 the differences over all pairs of bins of a band, both in
+    arcsec.  The errors of two bands are assumed to be independent.  If both use the same catalogue
+    stars in the same frames, the errors of the catalogue cancel in the difference.  Its noise is
+    then overestimated, and its noise-free part underestimated.
+
+    Parameters
+    ----------
+    bands : mapping of str to BinnedSums
+        Binned residuals of each band, with equal numbers of bins over the same field.
+    rng : numpy.random.Generator
+        Random generator for the errors.
+    arcsec : mapping of str to float
+        Arcsec per pixel of each band.
+    absorbed : mapping of str to int
+        Number of coefficients per axis that were fitted to these stars, for example 15 at order 4;
+        1 for a model that was not fitted to them.
+
+    Returns
+    -------
+    dict of str to StatisticsTable
+        Tables that have rows; Table 5-2 needs at least two bands.
+
+    Raises
+    ------
+    DegenerateError
+        If too few bins of a band have two stars.
+    """
+    pixels = {(name, axis): bands[name].values(axis) for name, axis in product(bands, BAND_AXES)}
+    scaled = {(name, axis): values.scaled(arcsec[name]) for (name, axis), values in pixels.items()}
+    fitting = tuple(
+        # the fit does not reduce the scatter of single stars (radial rows)
+        bin_row(
+            f"{name}/{axis}", values, absorbed=1 if axis == "radial" else absorbed[name], rng=rng
+        )
+        for (name, axis), values in pixels.items()
+    )
+    between = tuple(
+        bin_row(
+            f"{later}-{earlier}/{axis}",
+            scaled[later, axis].minus(scaled[earlier, axis]),
+            absorbed=max(absorbed[earlier], absorbed[later]),
+            rng=rng,
+        )
+        for (earlier, later), axis in product(combinations(bands, 2), _AXES)
+    )
+    all_pairs = tuple(
+        pair_row(f"{name}/{axis}", scaled[name, axis], absorbed=absorbed[name], rng=rng)
+        for name, axis in product(bands, _AXES)
+    )
+    aligned = "Single-frameset band-to-band alignment residuals"
+    within = "In-band multiframe alignment residuals"
+    tables = {
+        "5-1": StatisticsTable("Distortion fitting residuals", "Band/Axis", "pix", fitting),
+        "5-2": StatisticsTable(aligned, "Bands/Axis", "arcsec", between),
+        "5-3": StatisticsTable(within, "Band/Axis", "arcsec", all_pairs),
+    }
+    return {name: table for name, table in tables.items() if table.rows}
 
 
 @dataclass(frozen=True)

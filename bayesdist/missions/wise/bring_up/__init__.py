@@ -1,1 +1,0 @@
-"""Bring-up of a calibration from unmatched star lists, by alternate matching and fitting."""

@@ -1,1 +1,0 @@
-"""Linear transformations of the reference positions of RvB pairs (TRSrvb and RERrvb)."""
