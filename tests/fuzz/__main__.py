@@ -11,7 +11,7 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from tests.fuzz.cases import drawn, kept
+from tests.fuzz.cases import drawn, kept, swept
 from tests.fuzz.inputs import inputs
 from tests.fuzz.mutation import MUTATIONS
 from tests.fuzz.verdicts import not_taken, table_of, tried
@@ -27,6 +27,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--only", default="", help="inputs whose name or kind has this in it")
     parser.add_argument("--kept", action="store_true", help="only the cases that failed once")
+    parser.add_argument("--swept", action="store_true", help="every entry of every JSON file")
+    parser.add_argument("--part", default="1/1", help="K/N: the K-th of N parts of these cases")
     parser.add_argument("--failed", metavar="FILE", help="write the cases that failed")
     parser.add_argument("--json", metavar="FILE", help="write counts and failures")
     given = parser.parse_args(arguments)
@@ -38,7 +40,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         cases = kept()
         if given.cases < SHORT and not given.kept:
             cases = list({case.mutation: case for case in cases}.values())
-        if not given.kept:
+        if given.swept:
+            k, n = map(int, given.part.split("/"))
+            cases = swept(known)[k - 1 :: n]
+        elif not given.kept:
             cases += drawn(known, given.cases, given.seed)
         verdicts, failed = [], []
         # an interrupt ends it with the counts so far

@@ -84,6 +84,28 @@ def drawn(inputs: Iterable[Input], n: int, seed: int) -> list[Case]:
     return out
 
 
+ENTRIES = (None, [], "abc")  # of no use in most places
+
+
+def swept(inputs: Iterable[Input]) -> list[Case]:
+    """Cases in which each entry of each JSON file is lost, or replaced by each of `ENTRIES`.
+
+    Of a list only the first item is replaced.  Every command that reads the file is tried.
+    """
+    return [
+        Case(one.name, command, mutation, arguments)
+        for one in inputs
+        if one.form == "json"
+        for command in one.commands
+        for at in trees.paths(json.loads(one.path.read_bytes()))
+        if all(not isinstance(key, int) or key == 0 for key in at)
+        for mutation, arguments in [
+            ("entry_lost", {"at": at}),
+            *(("entry_is", {"at": at, "value": value}) for value in ENTRIES),
+        ]
+    ]
+
+
 def _of_input(one: Input, n: int, seed: int) -> list[Case]:
     found: list[Case] = []
 

@@ -61,7 +61,10 @@ def further_errors(
     `discrepancy` is the section 'discrepancy' of summary.json, which states the correlation of
     structure between positions.
     """
-    correlation = tuple((discrepancy or {}).get("structure_correlation", ()))
+    correlation = [
+        (float(fraction), float(length))
+        for fraction, length in (discrepancy or {}).get("structure_correlation", ())
+    ]
     return tuple(
         FurtherError(
             str(row["name"]),
@@ -69,9 +72,7 @@ def further_errors(
             float(row["u"]),
             float(row["v"]),
             str(row.get("source", "")),
-            tuple((float(part), float(length)) for part, length in correlation)
-            if row["name"] == STRUCTURE
-            else (),
+            tuple(correlation) if row["name"] == STRUCTURE else (),
         )
         for row in budget
         if row["name"] not in IN_COVARIANCE and row["kind"] not in (PRODUCT, TOTAL)

@@ -11,6 +11,8 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 from bayesdist.app.config import installed_kinds
 
 Number = float | None  # null where it is not finite, or not known
+Fraction = Annotated[float, Field(ge=0, le=1)]
+PositiveLength = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
 class SummaryPart(BaseModel):
@@ -313,6 +315,9 @@ class CorrelatedErrorsSection(SummaryPart):
     """Distortion that the model may leave out, estimated from the residuals of all stars."""
 
     structure: list[StructureRow]
+    structure_correlation: list[tuple[Fraction, PositiveLength]] = Field(
+        [], description="fraction of the variance and correlation length (pixels) of each field"
+    )
     unit: str
     noise_ratio: Number = Field(description="variance by the stars' scatter over the formal one")
 

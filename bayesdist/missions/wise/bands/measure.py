@@ -10,6 +10,7 @@ import numpy as np
 
 from bayesdist.app.run import Run
 from bayesdist.app.store.rundir import RunDirectory
+from bayesdist.app.store.summary import head_of
 from bayesdist.assess import pixel_scale_of, uncertainty_map
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.assess.account import PRINTED_BINS, accounts, partition_parts
@@ -126,7 +127,7 @@ def _measured(
     return BandResult(
         name=band.name,
         path=band.path,
-        simulated=bool(run.directory.facts["config"]["data"]["simulated"]),
+        simulated=head_of(run.directory.facts)["simulated"],
         converged=convergence.converged,
         reasons=tuple(convergence.reasons),
         arcsec=band.arcsec,
