@@ -536,6 +536,7 @@ def _sums(stars: Stars, code: Int, n: int, theta: Float, clip: Clip) -> FoldStat
         stars.model.order,
         chi2_limit=clip.chi2_limit,
         abs_limit=clip.abs_limit,
+        spared_chi2=clip.spared_chi2,
     )
     K = stars.model.n_terms
     weight, right = np.zeros((n, 2, K, K)), np.zeros((n, 2, K))

@@ -121,6 +121,7 @@ def least_squares(
         stars.model.order,
         chi2_limit=np.inf if clip is None else clip.chi2_limit,
         abs_limit=np.inf if clip is None else clip.abs_limit,
+        spared_chi2=0.0 if clip is None else clip.spared_chi2,
         corner=corner,
         power=power,
     )

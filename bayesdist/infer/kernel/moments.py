@@ -179,7 +179,8 @@ def _least_squares(
     pieces, columns, coef_about, coef_test, order, rules, sums, scalars,
 ):  # fmt: skip
     whole_vectors()
-    chi2_limit, r2_limit, corner, power = rules[0], rules[1], rules[2], int(rules[3])
+    chi2_limit, r2_limit, spared = rules[0], rules[1], rules[2]
+    corner, power = rules[3], int(rules[4])
     zero, turned = spread(0.0, load(about, 0, 0)), len(columns[6]) > 0
     for b in range(start, stop):
         g, first, end = pieces[b]
@@ -196,8 +197,10 @@ def _least_squares(
                 iu, iv = 1.0 / load(stars, 4, s), 1.0 / load(stars, 5, s)
                 du, dv = u - load(test, 0, s), v - load(test, 1, s)
                 present = first_lanes(n - s, spread(1.0, x), 0.0)
+                square = du * du * iu + dv * dv * iv
                 near = choose(du * du + dv * dv, r2_limit, present, 0.0)
-                used = choose(du * du * iu + dv * dv * iv, chi2_limit, near, 0.0)
+                near = choose(square, spared, present, near)
+                used = choose(square, chi2_limit, near, 0.0)
                 extra = 1.0 + (corner - 1.0) * 0.5 * (x * x + y * y)
                 factor = used * extra * extra if power == 2 else used * extra
                 ru, rv = u - load(about, 0, s), v - load(about, 1, s)
@@ -336,6 +339,7 @@ def least_squares_moments(
     *,
     chi2_limit: float,
     abs_limit: float,
+    spared_chi2: float = 0.0,
     corner: float = 1.0,
     power: int = 1,
 ) -> Moments:
@@ -355,6 +359,8 @@ def least_squares_moments(
         Polynomial order.
     chi2_limit, abs_limit : float
         Stars with a larger chi-square, or a larger radial residual, are rejected.
+    spared_chi2 : float
+        Chi-square up to which a star is kept whatever its residual is.
     corner : float
         Factor on the inverse variance in the corners, increasing with the square of the radius.
     power : int
@@ -369,7 +375,7 @@ def least_squares_moments(
     """
     K = (order + 1) * (order + 2) // 2
     sums, scalars = empty_sums(len(pieces), order, 6, N_LEAST)
-    rules = np.array([chi2_limit, min(abs_limit, 1e150) ** 2, corner, float(power)])
+    rules = np.array([chi2_limit, min(abs_limit, 1e150) ** 2, spared_chi2, corner, float(power)])
     with threads_for(EVALUATIONS * len(columns[0])):
         share_out(
             _least_squares,

@@ -36,6 +36,9 @@ from bayesdist.utils.quantities import Random, generator_of, takes, value_in, va
 
 MEDIAN_STARS = 1_000_000  # medians are taken over at most about this many stars
 MEDIAN_CHI2_2 = 2 * np.log(2)  # median of chi-square with two degrees of freedom
+# chi-square of a residual of four errors, within which the absolute limit does not apply: a true
+# match lies beyond with a probability of 3e-4
+WITHIN_ERRORS = 16.0
 
 
 @dataclass(frozen=True)
@@ -50,6 +53,8 @@ class Rejection:
         is scaled up with the median chi-square.
     clip_abs : float, Quantity or None
         Limit on the absolute residual of a star in the first pass, in pixels; None for no limit.
+        Stars are kept beyond it if their residual is within four of their own errors. If the quoted
+        errors are too large in general, these are taken as small as the median chi-square says.
     radial_weight : float
         Factor on the inverse variance in the corners; it increases with the square of the radius
         from 1 at the centre.
@@ -366,6 +371,7 @@ def _fitted(
         abs_limit=np.inf
         if rejection.clip_abs is None
         else rejection.clip_abs * model.pixel_size(theta),
+        spared_chi2=WITHIN_ERRORS * min(1.0, typical / MEDIAN_CHI2_2),
     )
     second = shards.sum(least_squares, clip.theta, clip, radial_weight)
     n_used, n_far = int(second.scalars[0]), int(second.scalars[1])

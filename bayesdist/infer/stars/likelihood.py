@@ -392,6 +392,8 @@ class Clip:
     theta: Float  # parameters (D,) of the first pass
     chi2_limit: float  # largest chi-square of a star (sum over both axes)
     abs_limit: float  # largest radial residual, in the unit of u, v
+    # chi-square up to which a star is kept whatever its residual: large errors explain this one
+    spared_chi2: float = 0.0
 
     def keeps(self, model: DistortionModel, matches: Matches) -> Bool:
         """Boolean mask (N,) that is True for matches within both limits, in table order."""
@@ -401,8 +403,9 @@ class Clip:
     def keeps_of(self, stars: Stars) -> Bool:
         """Boolean mask (N,) that is True for prepared stars within both limits."""
         residual = stars.residuals_along_axes(self.theta)
-        r2 = (residual**2).sum(axis=1)
-        return np.asarray((stars.chi2(residual) <= self.chi2_limit) & (r2 <= self.abs_limit**2))
+        r2, chi2 = (residual**2).sum(axis=1), stars.chi2(residual)
+        near = (r2 <= self.abs_limit**2) | (chi2 <= self.spared_chi2)
+        return np.asarray((chi2 <= self.chi2_limit) & near)
 
 
 @dataclass(frozen=True, eq=False)

@@ -82,15 +82,20 @@ def test_about_nothing_is_about_zero(problem):
     )
 
 
-def test_rejection_is_decided_at_other_parameters(problem):
+@pytest.mark.parametrize(("limit", "spared", "least"), [(0.5, 0.0, 700), (0.06, 9.0, 300)])
+def test_rejection_is_decided_at_other_parameters(problem, limit, spared, least):
     """About one theta, tested at another: the dense sums over the stars that stay."""
     model, stars, matches, theta = problem
     test = theta + 1e-4
-    found = least_squares(stars, theta, Clip(test, 20.0, 0.5))
+    clip = Clip(test, 20.0, limit, spared)
+    found = least_squares(stars, theta, clip)
     r = residual_of(model, test, matches)
     chi2 = ((r / np.column_stack([matches.sigma_u, matches.sigma_v])) ** 2).sum(axis=1)
-    used = (chi2 <= 20.0) & ((r**2).sum(axis=1) <= 0.25)
-    assert 700 < used.sum() < 900
+    near = (r**2).sum(axis=1) <= limit**2
+    used = (chi2 <= 20.0) & (near | (chi2 <= spared))
+    assert least < used.sum() < 900
+    assert (used & ~near).any() == (spared > 0)
+    np.testing.assert_array_equal(clip.keeps(model, matches), used)
     H, g, chi2 = dense_of(model, matches.select(used), theta)
     matrix, right = found.assemble(model, theta)
     close(matrix.dense(), H)

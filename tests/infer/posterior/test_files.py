@@ -263,10 +263,8 @@ def test_fit_round_trip(campaign, tmp_path, options):
     assert again.rejected == fit.rejected
     # the rule that tells which stars were used comes back whole, infinite limits included
     np.testing.assert_array_equal(again.clip.theta, fit.clip.theta)
-    assert (again.clip.chi2_limit, again.clip.abs_limit) == (
-        fit.clip.chi2_limit,
-        fit.clip.abs_limit,
-    )
+    for name in ("chi2_limit", "abs_limit", "spared_chi2"):
+        assert getattr(again.clip, name) == getattr(fit.clip, name), name
     np.testing.assert_array_equal(again.uses(matches), fit.uses(matches))
     assert again.uses(matches).sum() == fit.n_used < len(matches)
     with xr.open_dataset(tmp_path / "fit.nc", engine="h5netcdf") as data:

@@ -189,6 +189,23 @@ def test_the_absolute_limit_counts_in_pixels_whatever_the_unit():
     np.testing.assert_array_equal(np.flatnonzero(~fit.uses(mas)), [3])
 
 
+def test_the_absolute_limit_does_not_truncate_stars_with_large_errors():
+    """A third has errors of 2 px, as by assumed motions; chi-square is that of all stars."""
+    rng = np.random.default_rng(31)
+    large = np.arange(3000) % 3 == 0
+    sigma = np.where(large, 2.0, 0.05)
+    model, matches, _ = simulated(31, 3000, order=2, sigma=(sigma, sigma))
+    bad = np.flatnonzero(~large)[rng.choice(2000, 40, replace=False)]
+    u = matches.u.copy()
+    u[bad] += 2.5  # false matches of stars with small errors
+    matches = table(matches.x, matches.y, u, matches.v, sigma=sigma)
+    fit = fit_linear(matches, model, rejection=Rejection(clip_chi2=1e9))
+    far = np.flatnonzero(~fit.uses(matches))
+    assert set(bad) <= set(far) and len(far) <= len(bad) + 4  # 1000 exp(-8) lie beyond four errors
+    # chi-square has this mean and scatter; all residuals within 2 px would give 0.81
+    assert fit.chi2 / fit.dof == pytest.approx(1.0, abs=4 * np.sqrt(2 / fit.dof))
+
+
 def test_errors_that_are_too_small_as_a_whole_do_not_reject_everything():
     model, matches, _ = simulated(7, 500, order=2, sigma=0.05)
     small = matches.with_errors((0.002, 0.002))
