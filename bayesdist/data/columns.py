@@ -26,8 +26,9 @@ from bayesdist.data.tables.checks import (
     refuse_half,
 )
 from bayesdist.data.tables.column import check_unit, conversion, unit_of, without_unit
+from bayesdist.data.tables.names import ASSUMED
 from bayesdist.errors import InputError
-from bayesdist.utils.arrays import Float, Int
+from bayesdist.utils.arrays import Bool, Float, Int
 from bayesdist.utils.text import refuse_control_characters
 
 LABELS_OF_CODES = {
@@ -42,7 +43,7 @@ _NOMINAL = ("u_nominal", "v_nominal")
 _MOTIONS = ("pm_u", "pm_v", "sigma_pm_u", "sigma_pm_v")
 CORRELATION = "rho_uv"
 OPTIONAL = (CORRELATION, "epoch", "mag", "colour", *_NOMINAL, *_MOTIONS)
-_INTEGERS = ("row", "source", "star", *LABELS_OF_CODES)
+_INTEGERS = ("row", "source", "star", ASSUMED, *LABELS_OF_CODES)
 _NUMBERS = (*POSITIONS, *SIGMAS, *OPTIONAL)
 COLUMNS = (*_NUMBERS, *_INTEGERS)
 Columns = Mapping[str, NDArray[Any]]
@@ -158,6 +159,7 @@ class MatchColumns:
     notes: tuple[str, ...] = ()
     match_radius: float | None = None
     rho_uv: Float | None = None
+    assumed_motion: Int | None = None
 
     def _complete(self) -> None:
         """Fill in the defaults, convert every array to its type, and check the values."""
@@ -190,6 +192,13 @@ class MatchColumns:
     def chip_number(self) -> Int:
         """Chip number of each star (N,)."""
         return np.asarray(self.chip_numbers, np.int64)[self.chip]
+
+    @property
+    def motion_is_assumed(self) -> Bool:
+        """Boolean mask (N,) of the stars whose motion is assumed instead of measured."""
+        if self.assumed_motion is None:
+            return np.zeros(len(self.x), bool)
+        return np.asarray(self.assumed_motion != 0)
 
     def grouped(self, by: str) -> tuple[tuple[str, ...], Int]:
         """Labels of groups of stars, and the code of each star's group.
@@ -387,6 +396,8 @@ def joined_arguments(tables: Sequence[MatchColumns]) -> dict[str, Any]:
         )
     stars = [t.star for t in tables if t.star is not None]
     joined["star"] = np.concatenate(stars) if len(stars) == len(tables) else None
+    if any(t.assumed_motion is not None for t in tables):
+        joined[ASSUMED] = np.concatenate([t.motion_is_assumed for t in tables]).astype(np.int64)
     for name, labels in {**LABELS_OF_CODES, "source": "sources"}.items():
         joined[name], joined[labels] = merged_codes(
             [getattr(t, name) for t in tables],

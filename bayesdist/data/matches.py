@@ -35,6 +35,7 @@ from bayesdist.data.reading.options import (
 )
 from bayesdist.data.reading.table import match_arguments, sky_table
 from bayesdist.data.repeated import check_same_position, error_codes, star_codes
+from bayesdist.data.tables.names import ASSUMED
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.quantities import Direction, Epoch, Number, values_in
@@ -113,6 +114,9 @@ class Matches(MatchColumns):
         Proper motion of the reference star in `unit` per year, and its standard errors, if the
         catalogue has them: both axes or neither. If `notes` state that the stars were moved, u and
         v already include the motion.
+    assumed_motion : ndarray of int, optional
+        1 for stars whose motion is not measured but assumed, with its error; 0 for others. None if
+        no motion is.
     chip_names : tuple of str
         Names of the chips in `chip_numbers`, if the file has names instead of numbers.
     notes : tuple of str
@@ -811,6 +815,39 @@ class Matches(MatchColumns):
         code = {name: k for k, name in enumerate(names)}
         codes = np.array([code.get(name, -1) for name in self.exposure_names], np.int64)
         return self.with_columns(exposure=codes[self.exposure], exposure_names=names)
+
+    def without_assumed_motions(self) -> Matches:
+        """These stars without those whose motion is assumed instead of measured.
+
+        The errors of such stars are large and do not depend on their magnitude, so that errors by
+        magnitude do not hold for them.
+
+        Returns
+        -------
+        Matches
+            The same object if no motion is assumed. The others are counted in `rejected`.
+
+        Raises
+        ------
+        InputError
+            If no motion is measured, or if the stars are on disk and some motions are assumed.
+        """
+        if not self.has(ASSUMED):
+            return self
+        if not self.in_memory:
+            raise InputError(
+                "stars without a measured motion are to be left out, and the stars are on disk",
+                where=", ".join(self.sources),
+                do="leave them out of the table, or load() the stars",
+            )
+        assumed = self.motion_is_assumed
+        if assumed.all():
+            raise InputError(
+                "no star has a measured motion, and errors by magnitude do not hold for others",
+                where=", ".join(self.sources),
+                do="give measured motions, or errors as columns",
+            )
+        return self.select(~assumed, reason="no proper motion") if assumed.any() else self
 
     def with_errors(self, errors: Errors, *, in_quadrature: bool = False) -> Matches:
         """These stars with other errors.

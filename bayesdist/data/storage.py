@@ -63,6 +63,7 @@ from bayesdist.data.sky import (
 )
 from bayesdist.data.tables.checks import columns_of, refuse_half
 from bayesdist.data.tables.column import Quantities, SourceColumn
+from bayesdist.data.tables.names import ASSUMED
 from bayesdist.data.tables.parquet import ParquetPart, RowBlock, describe_part
 from bayesdist.errors import FormatError, InputError
 from bayesdist.files.atomic import atomic_path, made_folder
@@ -206,7 +207,7 @@ def open_matches(path: PathLike | Sequence[PathLike], **options: Unpack[ReadArgu
     if all(part.moves for part in stored):
         stored = _with_motion_prior(stored, reading.motion_prior)
     labels = scan(stored)
-    matches = Matches.from_readers(_readers(labels, stored), labels, _columns_of(first))
+    matches = Matches.from_readers(_readers(labels, stored), labels, _columns_of(stored[0]))
     return matches if isinstance(sigma, str) else matches.with_errors(sigma)
 
 
@@ -250,6 +251,8 @@ def _columns_of(file: StoredFile) -> set[str]:
     available = set(file.found) & set(COLUMNS) | {*POSITIONS, *LABELS_OF_CODES, "row", "source"}
     if file.options.epoch is not None:
         available.add("epoch")
+    if file.motion_prior is not None:
+        available.add(ASSUMED)
     if _has_errors(file):
         available |= set(SIGMAS)
     correlated = "sigma_ra" in file.found and states_correlations(file.found)
@@ -337,9 +340,12 @@ class StoredFile:
         options = replace(self.options, unit=self.unit, chips=self.options.chips or {})
         for block in self.part.blocks(columns, encoded=encoded, start=start, stop=stop, size=size):
             quantities = self._quantities(block, column_names)
+            assumed = np.zeros(len(quantities), bool)
             if self.motion_prior is not None:
-                quantities = self.motion_prior.filled(quantities)
+                quantities, assumed = self.motion_prior.filled(quantities)
             out = match_columns(quantities, options)
+            if self.motion_prior is not None:
+                out[ASSUMED] = (assumed | (out.get(ASSUMED, 0) != 0)).astype(np.int64)
             for key, labels in LABELS_OF_CODES.items():
                 if key not in column_names:
                     exposure_label = self.exposure_name if key == "exposure" else None

@@ -479,3 +479,58 @@ def test_a_prior_without_errors_that_grow_is_refused():
     noise = np.random.default_rng(1).normal(0, 0.1, (2, len(t)))
     t["x"], t["y"] = 3 * np.stack([now.u, now.v]) + 500 + noise
     assert len(bd.calibrate(masked(t, gone), sigma=0.01, **run).matches) == 40
+
+
+@pytest.mark.parametrize("how", ["read for it", "read with errors", "read from a written table"])
+def test_errors_by_magnitude_come_from_measured_stars(how):
+    """With 45 % of the stars without a motion, against the scatter that was drawn."""
+    n, rng = 6000 if FULL else 3000, np.random.default_rng(12)
+    t, _ = field(n)
+    gone = rng.random(n) < 0.45
+    sky = read(t, epoch=EPOCH)  # without errors of the centroids
+    scale = np.ptp(sky.u) / 3000.0  # arcsec per pixel
+    true = 0.05 * scale * 10 ** (0.1 * (np.asarray(t["phot_g_mean_mag"]) - 15.0))
+    for axis, place in (("x", sky.u), ("y", sky.v)):
+        t[axis] = 2500.0 + (place + true * rng.normal(size=n)) / scale
+    t = masked(t, gone)
+    sigma = "by_magnitude" if how == "read for it" else "columns"
+    stars = read(t, epoch=EPOCH, sigma=sigma)
+    assert stars.motion_is_assumed.sum() == (0 if how == "read for it" else gone.sum())
+    if how == "read from a written table":
+        stars = bd.Matches.from_table(stars.to_table())
+    model = bd.build_model(stars, order=1, size=(5000, 5000))
+    _, used, errors = bd.fit_by_magnitude(stars, model)
+    assert len(used) == np.count_nonzero(~gone)
+    assert used.rejected == {"no proper motion": np.count_nonzero(gone)}
+    catalogue = 0.05e-3 * np.hypot(1.0, YEARS)
+    for sigma in (errors.sigma_u, errors.sigma_v):
+        expected = np.hypot(0.05 * scale * 10 ** (0.1 * (errors.mag - 15.0)), catalogue)
+        assert np.sqrt(np.mean((sigma / expected) ** 2)) == pytest.approx(1.0, abs=0.05)
+        np.testing.assert_allclose(sigma / expected, 1.0, atol=0.12)
+    if how == "read with errors":
+        run = bd.calibrate(stars, order=1, size=(5000, 5000), sigma="by_magnitude", seed=1)
+        assert run.fit.n_rows + len(run.held_stars or ()) == np.count_nonzero(~gone)
+
+
+def test_matches_with_assumed_motions_are_marked_wherever_they_come_from(rng, tmp_path):
+    t, _ = field(900)
+    gone = third(900)
+    detections, wcs = seen_table(t, rng)
+    t = masked(t, gone)
+    options = {"radius": 0.5, "wcs": wcs, "epoch": EPOCH}
+    for catalogue_ in (t, catalog_from_table(t, tangent_point=POINT)):
+        m = bd.match(detections, catalogue_, **options)
+        np.testing.assert_array_equal(m.motion_is_assumed, gone[m.star])
+    stars = read(t, epoch=EPOCH)
+    np.testing.assert_array_equal(stars.motion_is_assumed, gone)
+    measured = read(field(50, 9)[0], epoch=EPOCH)
+    assert measured.assumed_motion is None and measured.without_assumed_motions() is measured
+    both = bd.Matches.concatenate([stars, measured])
+    np.testing.assert_array_equal(both.motion_is_assumed, [*gone, *np.zeros(50, bool)])
+    pq.write_table(pyarrow.Table.from_pandas(t.to_pandas()), tmp_path / "stars.parquet")
+    stored = bd.open_matches(tmp_path / "stars.parquet", epoch=EPOCH, tangent_point=POINT)
+    np.testing.assert_array_equal(stored.load().motion_is_assumed, gone)
+    with pytest.raises(InputError, match="the stars are on disk"):
+        bd.fit_by_magnitude(stored, bd.build_model(stored.load(), order=1, size=(1000, 1000)))
+    with pytest.raises(InputError, match="no star has a measured motion"):
+        stars.select(gone).without_assumed_motions()

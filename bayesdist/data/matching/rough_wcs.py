@@ -66,7 +66,7 @@ from bayesdist.data.sky import (
 )
 from bayesdist.data.tables.checks import without_missing
 from bayesdist.data.tables.column import Quantities, unit_of
-from bayesdist.data.tables.names import ALIASES, PAIRS, find_columns, origin_of
+from bayesdist.data.tables.names import ALIASES, ASSUMED, PAIRS, find_columns, origin_of
 from bayesdist.errors import InputError
 from bayesdist.files.tables import read_table
 from bayesdist.utils.arrays import Float, Int
@@ -94,7 +94,7 @@ _FROM_DETECTIONS = (
         *CENTROIDS,
     ),
 )
-_FROM_CATALOGUE = ("ra", "dec", *SKY_QUANTITIES, "mag", "flux", "colour", "star")
+_FROM_CATALOGUE = ("ra", "dec", *SKY_QUANTITIES, "mag", "flux", "colour", "star", ASSUMED)
 _MARGIN = 0.5  # field radii around the detections in which catalogue stars are used
 _DISPLACEMENT = 10.0  # match radii by which detections are displaced to count chance pairs
 
@@ -369,6 +369,11 @@ def _reference(
             table, column_names, source=CATALOGUE, sigma_mas_yr=options.motion_prior, reject=True
         )
         table, of_motions = filled.table, (*of_motions, *filled.notes)
+        prior = filled.assumed if assumed is None else filled.assumed | assumed
+        if prior.any():
+            table = table.copy(copy_data=False)
+            table[ASSUMED] = prior.astype(int)
+            column_names[ASSUMED] = ASSUMED
     elif options.motion_prior is not None:
         raise InputError(
             "motion_prior is given, but no errors of matches include those of motions",

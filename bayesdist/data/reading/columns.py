@@ -16,7 +16,7 @@ from bayesdist.data.reading.options import ReadOptions
 from bayesdist.data.sky import SKY_QUANTITIES, onto_plane, reference_sky
 from bayesdist.data.tables.checks import refuse_half
 from bayesdist.data.tables.column import EncodedColumn, Quantities, SourceColumn, check_unit
-from bayesdist.data.tables.names import ALIASES, PAIRS, find_columns, origin_of
+from bayesdist.data.tables.names import ALIASES, ASSUMED, PAIRS, find_columns, origin_of
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Float, Int
 
@@ -288,6 +288,8 @@ def match_columns(quantities: Quantities, options: ReadOptions) -> dict[str, Any
         out["filter"], out["filter_names"] = column("filter").labels()
     if "star" in present:
         out["star"] = column("star").integers()
+    if ASSUMED in present:
+        out[ASSUMED] = column(ASSUMED).integers()
     if "chip" in present:
         out["chip"], out["chip_numbers"], out["chip_names"] = numbered_chips(
             column("chip"), options.chips

@@ -292,12 +292,16 @@ class MotionPrior:
                 out[quantities.found[key]] = Column(rho)
         return out
 
-    def filled(self, quantities: Quantities) -> Quantities:
-        """Quantities of a block of rows in which stars without a motion have that of the prior."""
+    def filled(self, quantities: Quantities) -> tuple[Quantities, Bool]:
+        """Quantities of a block of rows in which stars without a motion have that of the prior.
+
+        The mask (N,) is True for these stars.
+        """
         stars = MovingStars.of(quantities, self.unit)
         if stars is None or not stars.missing.any():
-            return quantities
-        return replace(quantities, table=_Replaced(quantities.table, self.columns(stars)))
+            return quantities, np.zeros(len(quantities), bool)
+        table = _Replaced(quantities.table, self.columns(stars))
+        return replace(quantities, table=table), stars.missing
 
     def note(self, magnitude: Float, n_missing: int, n: int) -> str:
         """Clause about the `n_missing` of `n` stars that have a motion from the prior.

@@ -44,9 +44,9 @@ class ReadOptions:
     ----------
     columns : mapping of str to str, optional
         Column of each quantity: x y u v ra dec sigma_u sigma_v epoch exposure chip filter mag flux
-        colour star u_nominal v_nominal, and with ra and dec sigma_ra sigma_dec pm_ra pm_dec
-        sigma_pm_ra sigma_pm_dec parallax sigma_parallax catalogue_epoch and the correlations
-        of these (corr_ra_dec, corr_ra_pm_ra, ...). Other
+        colour star assumed_motion u_nominal v_nominal, and with ra and dec sigma_ra sigma_dec
+        pm_ra pm_dec sigma_pm_ra sigma_pm_dec parallax sigma_parallax catalogue_epoch and the
+        correlations of these (corr_ra_dec, corr_ra_pm_ra, ...). Other
         quantities are searched for under their usual names (`ALIASES`), ignoring case; an empty
         name omits a quantity. With ra and dec, u and v are on the tangent plane in arcsec.
     unit : {'pix', 'arcsec', 'mas', 'deg'}, optional

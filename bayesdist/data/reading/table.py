@@ -25,7 +25,7 @@ from bayesdist.data.repeated import star_codes
 from bayesdist.data.sky import MOTIONS, SPARED, sky_columns
 from bayesdist.data.tables.checks import absent, row_number, without_missing
 from bayesdist.data.tables.column import Quantities, length_in_mm, unit_of, without_unit
-from bayesdist.data.tables.names import ALIASES, PAIRS, find_columns
+from bayesdist.data.tables.names import ALIASES, ASSUMED, PAIRS, find_columns
 from bayesdist.errors import InputError
 from bayesdist.files.parquet import arrow_table
 from bayesdist.utils.arrays import Float
@@ -266,6 +266,7 @@ def match_arguments(
     if options.epoch is None and "pm_ra" in column_names and "epoch" not in column_names:
         options = replace(options, epoch=own_epoch(table.meta))
     moves = are_moved(options, column_names, source)
+    assumed = np.zeros(len(table), bool)
     if moves:
         filled = with_prior_motions(
             table,
@@ -274,7 +275,7 @@ def match_arguments(
             sigma_mas_yr=options.motion_prior,
             reject=options.not_finite == "reject",
         )
-        table, notes = filled.table, (*notes, *filled.notes)
+        table, notes, assumed = filled.table, (*notes, *filled.notes), filled.assumed
     rows_with_values = partial(
         without_missing,
         table,
@@ -303,6 +304,8 @@ def match_arguments(
             where=error.where,
             do=f'correct such rows, or leave out {n_lost} of {n} with data.not_finite = "reject"',
         ) from error
+    if assumed.any():
+        out[ASSUMED] = (assumed[stay] | (out.get(ASSUMED, 0) != 0)).astype(np.int64)
     if identify and "star" not in out:
         # compare catalogue positions: proper motion moves a star differently in each exposure
         first, second = sky_columns(quantities) if "ra" in column_names else (out["u"], out["v"])

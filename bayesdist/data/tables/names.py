@@ -9,6 +9,7 @@ from typing import Any
 from bayesdist.errors import InputError
 
 # lower case; the first name that the file has is used, and for a pair the first that both have
+ASSUMED = "assumed_motion"  # quantity that is 1 for stars without a measured motion
 BASIC: dict[str, tuple[str, ...]] = {
     "x": ("x", "x_pix", "xpix", "x_raw", "xraw", "xwin_image", "xpsf_image", "x_image"),
     "y": ("y", "y_pix", "ypix", "y_raw", "yraw", "ywin_image", "ypsf_image", "y_image"),
@@ -100,6 +101,7 @@ ALIASES: dict[str, tuple[str, ...]] = {
     ),
     "colour": ("colour", "color", "bp_rp"),
     "star": BASIC["star"],
+    ASSUMED: (ASSUMED,),
     "u_nominal": ("u_nominal",),
     "v_nominal": ("v_nominal",),
 }

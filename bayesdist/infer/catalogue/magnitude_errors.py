@@ -66,7 +66,8 @@ def fit_by_magnitude(
     Parameters
     ----------
     matches : Matches
-        Stars with magnitudes; any errors in the table are replaced.
+        Stars with magnitudes; any errors in the table are replaced, and stars whose motion is
+        assumed are left out.
     model : DistortionModel
     rejection : Rejection
         See `fit_linear`.
@@ -82,9 +83,9 @@ def fit_by_magnitude(
     fit : LinearFit
         Fit to all matches with the new errors.
     matches : Matches
-        The matches with the new errors and without nominal positions. If a match circle truncates
-        the residuals, the errors describe the truncated distribution, so that a correction for the
-        circle must not be applied in addition.
+        The matches in the fit with the new errors and without nominal positions. If a match circle
+        truncates the residuals, the errors describe the truncated distribution, so that a
+        correction for the circle must not be applied in addition.
     errors : MagnitudeErrors
         Error as a function of magnitude at its nodes, and the scatter near each node.
 
@@ -109,6 +110,7 @@ def fit_by_magnitude(
             where="data.columns",
             do="map column 'mag' or give data.sigma another value",
         )
+    matches = matches.without_assumed_motions()
     count = max(STARS, PER_EXPOSURE * len(model.exposures) * len(model.chips))
     errors = _law(matches.sample(count), model, rejection, priors, max_iterations)
     table = matches.without("u_nominal", "v_nominal").with_errors(errors)

@@ -64,7 +64,9 @@ def match_stars(run: Run) -> Run:
         # the likelihood must not correct for the circle a second time.
         if stars.has_nominal:
             log.info("fit: nominal positions are not used with errors by magnitude")
-        stars = stars.without("sigma_u", "sigma_v", "rho_uv", "u_nominal", "v_nominal")
+        stars = stars.without_assumed_motions().without(
+            "sigma_u", "sigma_v", "rho_uv", "u_nominal", "v_nominal"
+        )
     if in_circle(stars, config):
         for fault in config.circle_faults():
             cause, _, do = fault.partition("; ")
