@@ -205,7 +205,32 @@ def test_differences_follow_the_covariance_in_fields_of_any_width(pixels, length
     for low, high in ((0.003, 0.02), (0.02, 0.06), (0.06, 0.2), (0.2, 0.6)):
         rows = (apart > low) & (apart < high)
         ratio = np.sqrt(square[rows].mean() / expected[rows].mean())
-        assert ratio == pytest.approx(1.0, abs=0.12 if low < 0.01 else 0.06), (low, high)
+        assert ratio == pytest.approx(1.0, abs=0.05), (low, high)
+
+
+@pytest.mark.parametrize("apart", [1e-4, 3e-4, 1e-3, 3e-3, 1e-2])
+@pytest.mark.parametrize("lengths", [0.01, 1.0, 10.0, 100.0])
+def test_differences_of_close_positions_follow_the_covariance_in_all_directions(
+    pixels, lengths, apart
+):
+    """Closed form 2 (V(0) - V(theta)) for pairs in random directions, and for their draws."""
+    scale, rng = 100.0, np.random.default_rng(8)
+    own = {"systematics_mas": 3.0, "correlation_deg": SIZE[0] * scale / 3.6e6 / lengths}
+    draws = drawn(pixels(), Catalogue("A", **own), scale=scale, n=1000)
+    x, y = (rng.uniform(30, m - 30, 100) for m in SIZE)
+    angle, d = rng.uniform(0, 2 * np.pi, 100), apart * SIZE[0]
+    x, y = np.concatenate([x, x + d * np.cos(angle)]), np.concatenate([y, y + d * np.sin(angle)])
+    expected = 2.0 * (3.0 / scale) ** 2 * -np.expm1(-apart * lengths)
+    domain = EvaluationDomain(draws.solution.model, np.ones(200, int), x, y, relative="pairs")
+    square = sum(f.total() for f in draws.at(domain) if f.rows and " A" in f.rows[0].name)
+    first, second = domain.pairs()
+    ratio = np.sqrt(square[second == first + 100] / expected)
+    assert np.sqrt(np.mean(ratio**2)) == pytest.approx(1.0, abs=0.05)
+    np.testing.assert_allclose(ratio, 1.0, atol=0.15)
+    fields = fields_at(draws, x, y)
+    errors = summed(fields, [n for n in fields.parts if n.startswith("reference catalogue A")])
+    of_draws = np.mean((errors[:, 100:] - errors[:, :100]) ** 2) / expected
+    assert np.sqrt(of_draws) == pytest.approx(1.0, abs=0.05 + 0.03)  # of 1000 draws
 
 
 @pytest.mark.parametrize("degrees", [1e12, 1e3, 1e-12, 1e-300])

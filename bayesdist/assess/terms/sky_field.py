@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,9 +21,13 @@ from bayesdist.utils.arrays import Float
 
 NODES = 12  # along u and v of the field, between which the field of errors is interpolated
 MODES = 40  # functions that represent the field beyond its constant and tilt
-# waves, each a sine and a cosine, that represent finer structure: at least 12, and as many as their
-# fraction of the variance times 100
+# bands of finer structure, each a wave of a sine and a cosine: at least 12, and as many as their
+# fraction of the variance times 100; wider ones than `BAND` are divided
 MIN_WAVES, MAX_WAVES = 12, 100
+BAND = 1.15  # largest ratio of the wavenumbers at the edges of a band
+FINEST = 2e-5  # separation in units of the diameter of the field to which differences are exact
+# ratio to the smallest wavenumber of the waves, beyond which each has the variance of its band
+EXACT = 3.0
 # scales in units of the diameter of the field: those outside are an error common to the field, or
 # errors that are independent at any two positions
 SCALES = (1e-9, 1e6)
@@ -81,14 +86,27 @@ class AngularCovariance:
             out += variance / np.hypot(1.0, k * scale)
         return out
 
-    def wavenumbers(self, smallest: float, n: int) -> Float:
-        """Wavenumbers (n,) beyond the smallest that have equal parts of the variance beyond it."""
-        quantiles = (np.arange(n) + 0.5) / n * self.beyond(smallest)
+    def bands(self, smallest: float, n: int, largest: float) -> tuple[Float, Float]:
+        """Wavenumbers (b,) of bands beyond the smallest, and the variance (b,) of each.
+
+        Bands have at most 1/n of the variance beyond the smallest wavenumber, and reach to the
+        largest in steps of at most `BAND`, so that differences at all separations down to its
+        inverse have their variance.  The last band has no upper edge.
+        """
+        quantiles = np.arange(1, n + 1)[::-1] / n * self.beyond(smallest)
         # `beyond` is at most the sum of v / (k s)
-        largest = 4.0 * n * sum(v / s for v, s in self.parts) / float(self.beyond(smallest))
-        k = np.geomspace(smallest, max(largest, 2.0 * smallest), 4000)
+        reach = 4.0 * n * sum(v / s for v, s in self.parts) / float(self.beyond(smallest))
+        k = np.geomspace(smallest, max(reach, largest, 2.0 * smallest), 4000)
         falling = np.log(self.beyond(k))  # numpy interpolates over rising values
-        return np.exp(np.interp(np.log(quantiles), falling[::-1], np.log(k)[::-1]))
+        edges = np.exp(np.interp(np.log(quantiles), falling[::-1], np.log(k)[::-1]))
+        edges = np.append(edges, max(largest, BAND * edges[-1]))
+        steps = [
+            np.geomspace(low, high, max(1, math.ceil(math.log(high / low) / math.log(BAND))), False)
+            for low, high in pairwise(edges)
+        ]
+        edges = np.append(np.concatenate(steps), edges[-1])
+        middle = np.sqrt(edges * np.append(edges[1:], BAND * edges[-1]))
+        return middle, -np.diff(self.beyond(edges), append=0.0)
 
 
 class SplitField:
@@ -97,7 +115,8 @@ class SplitField:
     The constant and tilt are the generalised least-squares estimate from the errors at nodes that
     cover the field, so that they are independent of the rest.  The rest is represented by the
     functions with the largest variance, and by waves for structure finer than these.  The sum has
-    the stated variance everywhere.
+    the stated variance everywhere, and the waves beyond `EXACT` that of the covariance, so that
+    differences of close positions follow it.
     """
 
     def __init__(
@@ -134,9 +153,12 @@ class SplitField:
         smallest = np.pi * math.sqrt(MODES) / (2.0 * self._half.mean())
         share = float(self._varying.beyond(smallest)) / self._varying.sigma**2
         n = max(MIN_WAVES, math.ceil(MAX_WAVES * share))
-        angle = GOLDEN_ANGLE * np.arange(n)
-        k = self._varying.wavenumbers(smallest, n)
+        finest = 1.0 / (FINEST * 2.0 * float(np.hypot(*self._half)))
+        k, variance = self._varying.bands(smallest, n, finest)
+        angle = GOLDEN_ANGLE * np.arange(len(k))
         self._waves = k * np.stack([np.cos(angle), np.sin(angle)])
+        self._of_waves = self._mas**2 * variance
+        self._exact = k > EXACT * smallest
 
     @property
     def n_rest(self) -> int:
@@ -166,12 +188,19 @@ class SplitField:
         phi = self._mas**2 * self._varying(cdist(sky, self._nodes)) @ self._modes
         common = np.square(self._plane(sky) @ self._tilt).sum(axis=1)
         variance = np.maximum((self._mas * self.covariance.sigma) ** 2 - common, 0.0)
+        # variance (N, waves): that of the covariance for fine waves, and the rest for the others
+        exact = float(self._of_waves[self._exact].sum())
+        others = np.where(self._exact, 0.0, self._of_waves)
+        fine = np.minimum(variance / exact, 1.0)[:, None] * np.where(
+            self._exact, self._of_waves, 0.0
+        )
+        variance = np.maximum(variance - exact, 0.0)
         size = np.square(phi).sum(axis=1)
-        # rounding may leave more in the functions than there is
+        # near nodes the functions may have more than there is
         phi *= np.sqrt(np.minimum(variance / np.where(size > 0, size, 1.0), 1.0))[:, None]
-        fine = np.sqrt(np.maximum(variance - size, 0.0) / self._waves.shape[1])[:, None]
-        phase = sky @ self._waves
-        return np.hstack([phi, fine * np.cos(phase), fine * np.sin(phase)])
+        fine += np.maximum(variance - size, 0.0)[:, None] * others / others.sum()
+        amplitude, phase = np.sqrt(fine), sky @ self._waves
+        return np.hstack([phi, amplitude * np.cos(phase), amplitude * np.sin(phase)])
 
 
 @dataclass(frozen=True, eq=False)
