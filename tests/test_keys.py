@@ -13,7 +13,7 @@ from pydantic import BaseModel
 
 from bayesdist.app.config import installed_kinds, parse_config
 from bayesdist.kinds.matches.config import data_sections
-from bayesdist.kinds.selfcal.patterns.config import PlanConfig
+from bayesdist.kinds.selfcal.patterns.command import PlanConfig
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 PAGES = ("configuration.md", "campaign.md", "self_calibration.md", "planning.md")

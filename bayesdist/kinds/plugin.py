@@ -9,9 +9,9 @@ PLUGIN = Plugin(
         "selfcal": "bayesdist.kinds.selfcal.config:SelfcalConfig",
     },
     reports=("bayesdist.kinds.campaign.report", "bayesdist.kinds.selfcal.report"),
-    first_commands={"init": "bayesdist.kinds.matches.commands:init"},
+    first_commands={"init": "bayesdist.kinds.commands:init"},
     commands={
-        "plan-dither": "bayesdist.kinds.selfcal.commands:plan_dither",
-        "release": "bayesdist.kinds.campaign.commands:release",
+        "plan-dither": "bayesdist.kinds.commands:plan_dither",
+        "release": "bayesdist.kinds.commands:release",
     },
 )

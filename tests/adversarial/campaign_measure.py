@@ -67,7 +67,7 @@ def assessed(truth: CampaignTruth, folder: Path, seed: int) -> Run:
     directory = RunDirectory.plan(folder / "run", settings, text, folder)
     run = after_stages(directory, *STAGES)
     # how the linear terms went with time takes longer than all the rest, and no error has it
-    with patch("bayesdist.kinds.campaign.time_dependence.write_series_tables"):
+    with patch("bayesdist.kinds.campaign.kind.write_series_tables"):
         return make_stages(run, ("diagnose", "evaluate"))
 
 

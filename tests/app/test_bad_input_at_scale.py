@@ -191,7 +191,7 @@ def test_a_part_that_is_damaged_between_two_stages(job, tmp_path):
 
 def test_a_part_that_is_damaged_while_it_is_read(job, tmp_path, monkeypatch):
     """After the scan, before the passes: found when the piece is read, with its row group."""
-    from bayesdist.kinds.matches import stars
+    from bayesdist.kinds.matches import kind as stars
 
     model_of = stars.model_of
     path = job.parent / "stars" / "b.parquet"

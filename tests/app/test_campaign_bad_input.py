@@ -18,7 +18,7 @@ from bayesdist.data import Matches
 from bayesdist.errors import DegenerateError
 from bayesdist.files.tables import read_table
 from bayesdist.infer import fit_linear, load_fit
-from bayesdist.kinds.campaign.input_validation import (
+from bayesdist.kinds.campaign.inputs import (
     distance_of_pointings,
     frames_not_set,
     shear_warnings,
@@ -620,9 +620,7 @@ def test_resuming_after_a_list_was_removed(resumable):
 def test_a_damaged_campaign_is_calibrated_and_says_so(campaign, monkeypatch):
     monkeypatch.setattr("bayesdist.app.stages.report", lambda run, pdf: [])
     # how linear terms went with time takes longer than all the rest, and is not asked here
-    monkeypatch.setattr(
-        "bayesdist.kinds.campaign.time_dependence.write_series_tables", lambda *_: None
-    )
+    monkeypatch.setattr("bayesdist.kinds.campaign.kind.write_series_tables", lambda *_: None)
     campaign.lists(scattered, ONE).lists(lambda t: t[t["chip"] == 1], "f606w-006")
     # a few steps: what is said does not rest on the draws
     campaign.replaced("target_ess = 100", "max_steps = 20")

@@ -17,7 +17,7 @@ from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data import read_matches
 from bayesdist.files.tables import read_table
 from bayesdist.infer import load_fit
-from bayesdist.kinds.campaign.parts import ExposuresAlone, ExposureScatter
+from bayesdist.kinds.campaign.linear_terms import ExposuresAlone, ExposureScatter
 from tests.app.support import (
     carried_out,
     cli,
@@ -80,7 +80,7 @@ def begin(folder: Path, run: Path, names: list[str], *, holdout: str = "", drift
 def run(folder):
     run = begin(folder, folder.parent / "release", parts(folder)[0], holdout=HOLDOUT)
     # how linear terms went with time takes longer than all the rest, and is not asked here
-    with patch("bayesdist.kinds.campaign.time_dependence.write_series_tables"):
+    with patch("bayesdist.kinds.campaign.kind.write_series_tables"):
         return carried_out(run, "match", "fit", "sample", "diagnose")
 
 

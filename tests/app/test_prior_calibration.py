@@ -18,7 +18,7 @@ from bayesdist.calibration.prior import prior_of_calibration
 from bayesdist.errors import InputError
 from bayesdist.infer import save_fit
 from bayesdist.infer.solution.linear import NO_REJECTION
-from bayesdist.kinds.matches.stars import earlier_calibration
+from bayesdist.kinds.matches.kind import earlier_calibration
 from tests.reduced import case_in_full, only_in_full
 
 from .support import as_table, good, refused

@@ -16,7 +16,7 @@ from bayesdist.diagnose.diagnostics import catalogue_covariance
 from bayesdist.infer import Posterior, Rejection, fit_linear
 from bayesdist.infer.stars.likelihood import OutlierMixture
 from bayesdist.kinds.campaign.inputs import errors_by_star
-from bayesdist.kinds.campaign.matched import PERIOD, SWING, scale_error
+from bayesdist.kinds.campaign.matching import PERIOD, SWING, scale_error
 from bayesdist.model import Chip, DistortionModel
 
 STARS, EXPOSURES = 60, 9

@@ -21,7 +21,7 @@ from bayesdist.infer.exposures.hierarchy import HierarchicalFit
 from bayesdist.infer.nodes import Matern, NodeGrid, TableFit
 from bayesdist.infer.solution.solution import TransformedSolution
 from bayesdist.kinds.campaign import fit as stage
-from bayesdist.kinds.campaign.matched import affine_model_of
+from bayesdist.kinds.campaign.matching import affine_model_of
 from bayesdist.kinds.campaign.series import Series
 from bayesdist.missions.hst.simulate import AcsCampaign, acs_model, read_acs
 from bayesdist.missions.hst.simulate.truth import OWN

@@ -15,10 +15,9 @@ from bayesdist.assess.solution import coefficient_table
 from bayesdist.diagnose.checks import structure_checks
 from bayesdist.diagnose.residuals.misfit import Misfit
 from bayesdist.infer import GaussianPriors, fit_linear
-from bayesdist.kinds.campaign.checks import campaign_checks
-from bayesdist.kinds.campaign.kind import held_by_prior
+from bayesdist.kinds.campaign.kind import campaign_checks, held_by_prior
+from bayesdist.kinds.campaign.report.linear_terms import course_of, line_error
 from bayesdist.kinds.campaign.report.lookup import binned_of, largest_cell, rms_of_cells
-from bayesdist.kinds.campaign.report.series import course_of, line_error
 from bayesdist.missions.hst.published import LINES, published_lines
 from bayesdist.missions.hst.simulate.distortion import DRIFT
 from bayesdist.model import TimeDependence

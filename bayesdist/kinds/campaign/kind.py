@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,27 +25,32 @@ from bayesdist.diagnose.overlap import OverlapTest
 from bayesdist.infer import GaussianPriors, LinearFit, Posterior
 from bayesdist.infer.catalogue.star_errors import StarErrors, StarInfluence, star_influence
 from bayesdist.infer.solution.solution import Solution
-from bayesdist.kinds.campaign.checks import campaign_checks
 from bayesdist.kinds.campaign.config import CampaignConfig
 from bayesdist.kinds.campaign.fit import fit_campaign
-from bayesdist.kinds.campaign.input_validation import refuse_campaign
 from bayesdist.kinds.campaign.inputs import (
     Inputs,
     errors_by_star,
     outline_of_campaign,
     read_campaign,
+    refuse_campaign,
 )
-from bayesdist.kinds.campaign.linear_terms import line_sections
-from bayesdist.kinds.campaign.matched import (
+from bayesdist.kinds.campaign.linear_terms import (
+    ExposureScatter,
+    line_sections,
+    write_series_tables,
+)
+from bayesdist.kinds.campaign.matching import (
     aberration_term,
+    campaign_lines,
     is_mirrored,
     load_matched_campaign,
+    match_lists,
     overlap_of,
 )
-from bayesdist.kinds.campaign.matching import campaign_lines, match_lists
-from bayesdist.kinds.campaign.parts import ExposureScatter
 from bayesdist.report.words import Terminology
-from bayesdist.utils.checks import Check
+from bayesdist.utils.checks import LARGER, Check, level_of
+from bayesdist.utils.limits import COMPLETENESS, FALSE_MATCHES
+from bayesdist.utils.numbers import count, percent
 
 if TYPE_CHECKING:
     from bayesdist.infer.compare.monitoring import NewFit
@@ -56,7 +61,6 @@ NEW_EXPOSURE = "a new exposure whose shift and rotation are fitted by its user"
 SAMPLING = 1  # number of the random stream of the stage 'sample', derived from the seed
 TOGETHER = 1.5  # node spacings over which errors of tables are correlated, from their covariance
 
-
 PAIRED = Terminology(
     prints_data=False,
     whom=f" for {NEW_EXPOSURE}",
@@ -65,6 +69,17 @@ PAIRED = Terminology(
     residuals=" These are the residuals of the joint fit, with all tables, in the cells of the test"
     " for structure (see the status).",
 )
+
+GROUP = "Campaign"
+
+# sections with warnings for the reader, their titles, and their effect on verdicts; deviations that
+# drift with time are not included in the errors drawn for a later exposure
+WARNING = {
+    "matching": ("Matching", ""),
+    "deviations": ("Deviations of the exposures", LARGER),
+    "tables": ("Look-up tables", ""),
+    "time_dependence": ("Time dependence", ""),
+}
 
 
 class CampaignKind(RunKind[CampaignConfig, Inputs]):
@@ -148,9 +163,7 @@ class CampaignKind(RunKind[CampaignConfig, Inputs]):
 
     def save_diagnosed(self, run: Run) -> None:
         """Write the linear terms of the exposures as a function of time."""
-        from bayesdist.kinds.campaign import time_dependence  # used by one stage
-
-        time_dependence.write_series_tables(run)
+        write_series_tables(run)
 
     def predictive(self, run: Run) -> Predictive:
         """Prediction with the scatter of exposures, and errors of catalogue and tables."""
@@ -215,7 +228,7 @@ class CampaignKind(RunKind[CampaignConfig, Inputs]):
         self, release: Run, new: Path
     ) -> tuple[Matches, NewFit, tuple[str, ...]]:
         """Fit of new exposures, which scatter as those of the release do."""
-        from bayesdist.kinds.campaign.monitoring import fit_new_exposures  # for one command
+        from bayesdist.kinds.campaign.fit import fit_new_exposures  # for one command
 
         return fit_new_exposures(release, new)
 
@@ -274,4 +287,54 @@ def _table_terms(run: Run, solution: Solution) -> tuple[LocalErrors, ...]:
     return (tables, *between)
 
 
+def campaign_checks(summary: Mapping[str, Any]) -> tuple[Check, ...]:
+    """Checks of matching, tables and series, including warnings of their stages."""
+    m, tables, time = (summary.get(k) or {} for k in ("matching", "tables", "time_dependence"))
+    lowest = float(m["completeness"]["least"])
+    false = float(m["false_fraction"])
+    out = [
+        Check(
+            GROUP,
+            "Matching: completeness of the exposures",
+            f"{percent(m['completeness']['median'])} at the median, {percent(lowest)} at least",
+            f"at least {percent(COMPLETENESS.value, 2)} in each",
+            level_of(COMPLETENESS.met_by(lowest), "warn"),
+        ),
+        Check(
+            GROUP,
+            "Matching: false pairs expected",
+            percent(false, 2),
+            f"at most {percent(FALSE_MATCHES.value, 2)}",
+            level_of(FALSE_MATCHES.met_by(false), "warn"),
+        ),
+    ]
+    if m.get("left_out"):
+        names = "; ".join(m["left_out"])
+        out.append(Check(GROUP, "Matching: exposures left out", names, "none", "warn"))
+    if "converged" in tables:
+        out.append(_converged("Look-up tables converged", tables))
+    if "converged" in time:
+        out.append(_converged("Series of linear terms converged", time))
+        off = len(time.get("outlying_exposures", ()))
+        out.append(Check(GROUP, "Exposures that lie off the lines", count(off)))
+    for title, key in (
+        ("Exposures that went wrong in the joint fit", "exposures_outlying"),
+        ("Exposures that could not be fitted alone", "exposures_skipped"),
+    ):
+        names = ", ".join(str(name) for name in summary.get(key) or ())
+        if names:
+            out.append(Check(GROUP, title, names, "none", "warn"))
+    out += [
+        Check(GROUP, name, level="warn", sentence=text, doubt=doubt)
+        for part, (name, doubt) in WARNING.items()
+        for text in summary.get(part, {}).get("warnings", [])
+    ]
+    return tuple(out)
+
+
 CAMPAIGN = CampaignKind()
+
+
+def _converged(what: str, section: Mapping[str, Any]) -> Check:
+    good = bool(section["converged"])
+    return Check(GROUP, what, "yes" if good else "NO", "yes", level_of(good, "warn"))

@@ -3,20 +3,53 @@
 ACS ISR 2015-06, Section 4.4.1, adopts one mean B_1 of WFC1 before SM4 and another after it.  A
 drift in the model has a rate, and a step at each break, for every term and chip.  Those that are
 not wanted are held at zero by a prior much narrower than any measurement error.
+
+The terms of single exposures scatter about those of the model, and are a series in time.  The drift
+and the tables of the detector can be taken over from the run of the reference filter.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+import logging
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
 
+import numpy as np
+from astropy.table import Table
+
+from bayesdist.app.artefacts.parts import Part, read_tables
+from bayesdist.app.artefacts.stored_fit import converged_posterior
+from bayesdist.app.config import Config
+from bayesdist.app.config.model import TablesBlock
+from bayesdist.app.config.run import TABLES, rates_file, tables_file
+from bayesdist.app.run import Run
 from bayesdist.app.store.keys import attributes
-from bayesdist.infer import GaussianPriors
+from bayesdist.app.store.output import write_table
+from bayesdist.errors import DegenerateError, InputError
+from bayesdist.infer import GaussianPriors, Posterior
+from bayesdist.infer.exposures.hierarchy import Settling
+from bayesdist.infer.exposures.shared_drift import drift_priors
 from bayesdist.infer.solution.solution import Solution, TransformedSolution
 from bayesdist.infer.solution.transforms import lines, reference_gauge, without_frames
-from bayesdist.model import DistortionModel, TimeDependence
+from bayesdist.kinds.campaign.series import (
+    Series,
+    SeriesPosterior,
+    TrendModel,
+    describe,
+    fit_series,
+)
+from bayesdist.model import Chip, DistortionModel, LookupTable, TimeDependence
+from bayesdist.products.registry import open_document
+from bayesdist.utils.arrays import Float
 
 CONSTANTS = (("u", 0, 0), ("v", 0, 0))
 SIGMA_HELD = 1e-6  # pixels, and pixels per year
+
+log = logging.getLogger("bayesdist")
+
+N_EPOCHS = 25  # epochs at which the drift is tabulated
+MIN_EXPOSURES = 8  # fewest exposures for a statement about time
 
 
 def with_gap(model: DistortionModel) -> DistortionModel:
@@ -78,3 +111,196 @@ def _lines(view: TransformedSolution) -> list[dict[str, object]]:
                     row |= {part: float(line.values[0]), f"sigma_{part}": float(line.sigma[0])}
                 out.append(row)
     return out
+
+
+@dataclass(frozen=True, eq=False)
+class ExposureScatter(Part):
+    """Scatter of the linear terms of the exposures about those of the model.
+
+    Parameters
+    ----------
+    kinds : tuple of str
+        Names of the k linear terms that scatter.
+    tau : ndarray, shape (n, k)
+        Posterior draws of the standard deviation of each term.
+    offsets : Settling
+        Relation between the constant terms of chips and the shifts of single chips.
+    """
+
+    title = "joint fit of exposures"
+    recorded = is_hierarchy = True
+
+    kinds: tuple[str, ...]
+    tau: Float
+    offsets: Settling
+
+    def averaged(self, posterior: Posterior, rng: np.random.Generator) -> Posterior:
+        """Posterior in which each chip has its mean position over the exposures."""
+        tau = self.tau[rng.integers(len(self.tau), size=len(posterior.flat))]
+        flat = self.offsets.draws(posterior.flat, tau, rng)
+        before, after = posterior.flat.std(axis=0), flat.std(axis=0)
+        scale = np.divide(after, before, out=np.ones_like(after), where=before > 0)
+        c = posterior.convergence
+        scale = np.append(scale, np.ones(len(c.names) - len(scale)))  # hyperparameters come last
+        return replace(
+            posterior,
+            theta=flat.reshape(posterior.theta.shape),
+            # the number of effective draws is unchanged, but the draws scatter less
+            convergence=replace(c, mcse_mean=c.mcse_mean * scale, mcse_sd=c.mcse_sd * scale),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class ExposuresAlone(Part):
+    """Linear terms of the exposures, each fitted without the others."""
+
+    title = "fits of single exposures"
+    recorded = True
+
+    series: Series
+
+
+def write_series_tables(run: Run) -> None:
+    """Write series.ecsv and drift.ecsv, and the section 'time_dependence' of summary.json."""
+    series, directory = run.part(ExposuresAlone).series, run.directory
+    time, seed = run.model.time, run.config.sampler.seed
+    if time is None or len(series.names) < MIN_EXPOSURES:
+        return
+    trend = TrendModel("lines" if time.breaks else "line", time.breaks, reference=time.epoch0)
+    try:
+        posterior = fit_series(series, trend, seed=seed)
+    except DegenerateError as error:
+        if run.config.has_free_rates:
+            raise
+        log.info("diagnose: no drift from these exposures alone: %s", error.cause)
+        return
+    write_table(_exposures(series, posterior), directory / "series.ecsv")
+    write_table(_predictions(posterior), directory / "drift.ecsv")
+    outlying = [
+        name for name, p in zip(series.names, posterior.outlier_probability, strict=True) if p > 0.5
+    ]
+    verdicts = [_verdict(series, k, time.breaks, seed) for k in range(len(series.coefficients))]
+    scatter = posterior.scatter_sigma.mean(axis=0).tolist()
+    directory.summarise(
+        time_dependence={
+            "converged": posterior.convergence.converged,
+            "lines": _trend_lines(posterior),
+            "scatter": dict(zip(series.coefficients, scatter, strict=True)),
+            "outlying_exposures": outlying,
+            "warnings": list(_disagreements(run.fit_facts["exposures_outlying"], outlying)),
+            "breaks": _changes(posterior),
+            "verdicts": verdicts,
+        }
+    )
+    for row in verdicts:
+        log.info("diagnose: %s: %s", row["term"], row["claim"])
+
+
+def _disagreements(known: Sequence[str], outlying: Sequence[str]) -> Iterator[str]:
+    """Clause on exposures that are outliers when fitted alone, but not in the joint fit."""
+    missed = [name for name in outlying if name not in known]
+    if missed:
+        yield (
+            f"{', '.join(missed)}, each fitted alone, {'lie' if len(missed) > 1 else 'lies'} off "
+            "the trend of the others, and the joint fit counts them as scatter"
+        )
+
+
+def _verdict(series: Series, k: int, breaks: tuple[float, ...], seed: int) -> dict[str, object]:
+    """Trend that describes one term best, judged by held-out exposures."""
+    verdict = describe(series.only(series.coefficients[k]), breaks=breaks, seed=seed)
+    return {"term": series.coefficients[k], "claim": verdict.claim, "text": verdict.text}
+
+
+def _trend_lines(posterior: SeriesPosterior) -> list[dict[str, object]]:
+    out: list[dict[str, object]] = []
+    for s, epoch0 in enumerate(posterior.reference):
+        for k, name in enumerate(posterior.series.coefficients):
+            row: dict[str, object] = {"segment": s, "term": name, "epoch0": float(epoch0)}
+            for part in ("alpha", "beta"):
+                draws = getattr(posterior, part)[:, s, k]
+                row |= {part: float(draws.mean()), f"sigma_{part}": float(draws.std(ddof=1))}
+            out.append(row)
+    return out
+
+
+def _changes(posterior: SeriesPosterior) -> list[dict[str, object]]:
+    out: list[dict[str, object]] = []
+    for number, date in enumerate(posterior.trend.breaks):
+        changes = dict(zip(("step", "slope_change"), posterior.change(number), strict=True))
+        for k, name in enumerate(posterior.series.coefficients):
+            row: dict[str, object] = {"break": date, "term": name}
+            for part, change in changes.items():
+                row |= {part: float(change.value[k]), f"sigma_{part}": float(change.sigma[k])}
+            out.append(row)
+    return out
+
+
+def _exposures(series: Series, posterior: SeriesPosterior) -> Table:
+    columns: dict[str, object] = {"exposure": list(series.names), "epoch": series.epoch}
+    sigma = np.sqrt(np.maximum(np.einsum("ekk->ek", series.cov), 0.0))
+    for k, name in enumerate(series.coefficients):
+        columns[name] = series.values[:, k]
+        columns[f"sigma_{name}"] = sigma[:, k]
+    columns["outlier_probability"] = posterior.outlier_probability
+    return Table(columns)
+
+
+def _predictions(posterior: SeriesPosterior) -> Table:
+    first, last = posterior.series.span
+    prediction = posterior.predict(np.linspace(first, last, N_EPOCHS))
+    columns: dict[str, object] = {"epoch": prediction.epoch}
+    for k, name in enumerate(posterior.series.coefficients):
+        columns[name] = prediction.mean[:, k]
+        columns[f"sigma_{name}"] = prediction.sigma[:, k]
+        columns[f"sigma_new_{name}"] = prediction.sigma_new[:, k]
+    return Table(columns)
+
+
+def held_tables(block: TablesBlock, chips: tuple[Chip, ...], base: Path) -> tuple[LookupTable, ...]:
+    """Look-up tables of the detector that are held fixed; empty if the configuration names none.
+
+    Raises InputError if any of `chips` has no table.
+    """
+    if block.detector is None:
+        return ()
+    path = tables_file(base / block.detector)
+    if path.name == TABLES:
+        stored = read_tables(path, do="run its stage 'fit' again").tables
+        tables = tuple(table for table in stored if not table.filter)
+    else:
+        tables = open_document(path).tables()
+    have = {table.chip for table in tables}
+    missing = [chip.name for chip in chips if chip.number not in have]
+    if missing:
+        raise InputError(
+            f"there is no table of the detector for chip {missing[0]}",
+            where=str(path),
+            do="name the run or the file of tables of this detector in tables.detector",
+        )
+    numbers = {chip.number for chip in chips}
+    ours = (table for table in tables if table.chip in numbers)
+    return tuple(sorted(ours, key=lambda table: table.chip))
+
+
+def rate_priors(config: Config, model: DistortionModel, base: Path) -> GaussianPriors | None:
+    """Priors on the drift of a model from the posterior of another run; None if it is free."""
+    tdd, chip = config.model.tdd, config.chips()[0].number
+    if tdd is None or config.has_free_rates:
+        return None
+    path = rates_file(base / tdd.rates)
+    posterior = converged_posterior(path, "its rates are used")
+    try:
+        named = drift_priors(posterior, model, chip=chip)
+    except InputError as error:
+        raise InputError(error.cause, where=str(path.parent), do=error.do) from error
+    return GaussianPriors.of(model, named)
+
+
+def rehearse_references(config: Config, unit: str, base: Path) -> None:
+    """Read everything that a run takes over from other runs, without fitting."""
+    chips = config.chips()
+    held_tables(config.tables, chips, base)
+    if not config.has_free_rates:
+        model = with_gap(DistortionModel(config.model.order, chips, unit, config.time()))
+        rate_priors(config, model, base)

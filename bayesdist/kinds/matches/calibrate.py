@@ -33,7 +33,7 @@ from bayesdist.data.reading.table import match_arguments
 from bayesdist.errors import ConfigError, InputError
 from bayesdist.infer import OutlierMixture
 from bayesdist.kinds.matches.config import MatchesConfig
-from bayesdist.kinds.matches.stars import read_stars
+from bayesdist.kinds.matches.kind import read_stars
 from bayesdist.model import Chip, TimeDependence
 from bayesdist.utils.quantities import value_in, values_in, year_of
 

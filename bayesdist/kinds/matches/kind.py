@@ -1,27 +1,72 @@
-"""Runs that begin with matched stars."""
+"""Runs that begin with matched stars: reading, fit with an optional prior, and sampling.
+
+The prior may be an earlier calibration.
+"""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
-from bayesdist.app.artefacts.stars import QUOTED, ErrorLaw, RunInput
-from bayesdist.app.artefacts.stored_fit import load_errors
+from bayesdist.app.artefacts.stars import (
+    QUOTED,
+    ErrorLaw,
+    RunInput,
+    in_circle,
+    model_of,
+    set_aside,
+    shards_of,
+)
+from bayesdist.app.artefacts.stored_fit import (
+    FIT,
+    FitArtefacts,
+    converged_posterior,
+    hierarchy_of,
+    load_errors,
+    read_stored_fit,
+)
+from bayesdist.app.config import Config
+from bayesdist.app.config.run import POSTERIOR, calibration_file
 from bayesdist.app.kinds.kind import RunKind
-from bayesdist.app.kinds.plausibility import doubt_on_positions, doubts_on_run
+from bayesdist.app.kinds.plausibility import (
+    doubt_on_positions,
+    doubts_on_run,
+    refuse_empty_segments,
+    refuse_stars,
+)
 from bayesdist.app.run import Run
 from bayesdist.app.store.rundir import RunDirectory
+from bayesdist.app.tables.result_files import load_diagnostics
+from bayesdist.assess.model import with_diagnosed_errors
+from bayesdist.calibration.calibration import Calibration, calibration_of
+from bayesdist.calibration.prior import CalibrationPrior, prior_of_calibration
 from bayesdist.data import Matches
 from bayesdist.diagnose.checks import frames_doubt
 from bayesdist.diagnose.residuals.epoch_shift import epoch_shift
-from bayesdist.diagnose.residuals.misfit import majority_sentence
-from bayesdist.errors import InputError
+from bayesdist.diagnose.residuals.misfit import error_scale, majority_sentence
+from bayesdist.diagnose.residuals.stars import SAMPLE
+from bayesdist.errors import ConfigError, DegenerateError, InputError, NotSettledError
+from bayesdist.infer import (
+    GaussianPriors,
+    LinearFit,
+    fit_by_magnitude,
+    fit_linear,
+    load_fit,
+)
+from bayesdist.infer.catalogue.added_errors import GroupedErrors, grouped_errors
+from bayesdist.infer.exposures.frame_choice import frames_that_help
+from bayesdist.infer.solution.geometry import geometries, refuse_geometry
+from bayesdist.infer.solution.linear import Rejection
 from bayesdist.kinds.matches.config import MatchesConfig
 from bayesdist.kinds.matches.sources import read_configured, source_of
-from bayesdist.kinds.matches.stars import fit_stars, match_stars, read_stars
+from bayesdist.model import DistortionModel
+from bayesdist.products.registry import read_calibration
 from bayesdist.utils.checks import LARGER, Check
+
+log = logging.getLogger("bayesdist")
 
 
 class MatchesKind(RunKind[MatchesConfig, Matches]):
@@ -104,4 +149,181 @@ class MatchesKind(RunKind[MatchesConfig, Matches]):
         return self.fit(run).errors if config.data.sigma == "by_magnitude" else QUOTED
 
 
+def fit_stars(run: Run) -> Run:
+    """Fit matched stars by least squares, with errors adjusted to the residuals.
+
+    After the fit the reader of the run holds the stars for later passes.  If the fit is degenerate
+    or does not settle, the error names the frames of the exposures that would help, if any.
+    """
+    config, stars = cast(MatchesConfig, run.config), run.stars
+    model = model_of(stars, config)
+    refuse_stars(run.reader.sample(stars), model, config)
+    if stars.in_memory and stars.epoch is not None:
+        # only for all stars: a sample may have none in a short segment
+        refuse_empty_segments(stars.epoch, model.time)
+    earlier = earlier_calibration(model, config, run.base)
+    try:
+        fitted = _fitted(run, model, config, earlier)
+    except (DegenerateError, NotSettledError) as error:
+        better = frames_that_help(stars.sample(SAMPLE), model)
+        if better is None:
+            raise
+        raise type(error)(error.cause, where=error.where, do=better.sentence) from error
+    refuse_geometry(
+        geometries(fitted["fit"]),
+        scale_mas=config.detector.scale_mas,
+        tangent_point=stars.tangent_point,
+        where=", ".join(stars.sources),
+    )
+    fit = replace(fitted["fit"], tangent_point=stars.tangent_point)
+    return run.having(**{**fitted, "fit": fit})
+
+
+def match_stars(run: Run) -> Run:
+    """Divide matched stars into fitted and held-out stars, as configured."""
+    config = cast(MatchesConfig, run.config)
+    stars: Matches = run.inputs
+    files = ", ".join(stars.sources)
+    if config.data.sigma == "by_magnitude":
+        # These errors are estimated from residuals that the match circle has truncated, so that
+        # the likelihood must not correct for the circle a second time.
+        if stars.has_nominal:
+            log.info("fit: nominal positions are not used with errors by magnitude")
+        stars = stars.without_assumed_motions().without(
+            "sigma_u", "sigma_v", "rho_uv", "u_nominal", "v_nominal"
+        )
+    if in_circle(stars, config):
+        for fault in config.circle_faults():
+            cause, _, do = fault.partition("; ")
+            raise ConfigError(cause, where=files, do=do)
+    config.mixture(stars.match_radius)  # uniform outliers need a radius
+    fitted, held, exposures = set_aside(config, stars)
+    return run.having(stars=fitted, held_stars=held, held_exposures=exposures)
+
+
+def read_stars(config: MatchesConfig, base: Path) -> Matches:
+    """Read the matched stars that a configuration names.
+
+    The stars keep the file names relative to `base`, so that a run does not depend on its folder.
+    """
+    data, size = config.data, config.detector.size
+    stars = read_configured(data.paths(base), data, size=size, chips=config.chip)
+    return stars.named_below(str(base))
+
+
 MATCHES = MatchesKind()
+
+
+def _fitted(
+    run: Run,
+    model: DistortionModel,
+    config: MatchesConfig,
+    earlier: CalibrationPrior | None,
+) -> FitArtefacts:
+    """Fit with errors by magnitude, or with the quoted errors adjusted to the residuals."""
+    stars, reader = run.stars, run.reader
+    priors = priors_of(model, config)
+    rejection = Rejection(config.fit.clip_chi2, config.fit.clip_abs, config.fit.radial_weight)
+    by_magnitude = config.data.sigma == "by_magnitude"
+
+    def begun(priors: GaussianPriors) -> tuple[LinearFit, ErrorLaw]:
+        """First fit, with errors by magnitude or with the quoted errors."""
+        if by_magnitude:
+            linear, _, errors = fit_by_magnitude(
+                stars, model, rejection=rejection, priors=priors, compute=reader.compute
+            )
+            return linear, ErrorLaw(by_magnitude=errors)
+        shards = shards_of(stars, model, config, QUOTED, reader)
+        return fit_linear(shards, model, rejection=rejection, priors=priors), QUOTED
+
+    if earlier is not None:
+        loose = replace(priors, joint=earlier.loose().joint)
+        # the covariance is rotated into the frame, which a first fit determines
+        turned = earlier.about(begun(loose)[0].mean) if earlier.turns else loose
+        priors = replace(priors, joint=turned.joint)
+        log.info(
+            "fit: the prior is %s, in %d of %d directions",
+            *(earlier.name, priors.n_informative, model.n_params),
+        )
+
+    def fitted(errors: ErrorLaw) -> LinearFit:
+        shards = shards_of(stars, model, config, errors, reader)
+        return fit_linear(shards, model, rejection=rejection, priors=priors)
+
+    linear, errors = begun(priors)
+    if by_magnitude:
+        return {"fit": linear, "errors": errors, "priors": priors}
+    factor = error_scale(linear, reader.sample(stars, errors))
+    if factor != 1.0:
+        errors = ErrorLaw(factor)
+        linear = fitted(errors)
+    grouped = compared_errors(config, linear, reader.sample(stars, errors), priors)
+    if grouped is not None and grouped.added is not None:
+        errors = ErrorLaw(factor, added=grouped.added)
+        linear = fitted(errors)
+    return {"fit": linear, "errors": errors, "priors": priors, "added_errors": grouped}
+
+
+def compared_errors(
+    config: Config, fit: LinearFit, sample: Matches, priors: GaussianPriors
+) -> GroupedErrors | None:
+    """Errors added to groups of stars, or a single jitter, from a fit with the quoted errors.
+
+    None if groups are not compared: the errors come from the residuals, the jitter is given or is
+    to be a single one, or the match circle has truncated the residuals.
+    """
+    if not config.compares_jitters or in_circle(sample, config):
+        return None
+    by = config.outliers.jitter_by
+    try:
+        return grouped_errors(
+            sample,
+            fit,
+            by="" if by == "auto" else by,
+            outliers=config.outliers.model != "none",
+            priors=priors,
+        )
+    except DegenerateError as error:
+        log.info("fit: one jitter for all stars: groups are not compared, as %s", error.cause)
+        return None
+
+
+def priors_of(model: DistortionModel, config: Config) -> GaussianPriors:
+    """Configured priors on the parameters."""
+    return GaussianPriors.of(model, {p.parameter: (p.mean, p.sigma) for p in config.prior})
+
+
+def earlier_calibration(
+    model: DistortionModel, config: Config, base: Path
+) -> CalibrationPrior | None:
+    """Prior from the calibration that a configuration names; None if it names none."""
+    block = config.prior_calibration
+    if block is None:
+        return None
+    path = calibration_file(base / block.source)
+    return prior_of_calibration(
+        _calibration(path, block.filter),
+        model,
+        frame=block.frame,
+        epoch=block.epoch,
+        change_pix=block.change_pix,
+    )
+
+
+def _calibration(path: Path, filter: str | None) -> Calibration:
+    """Calibration of a file, or of a run with the errors that its diagnostics found."""
+    if path.suffix != ".nc":
+        return read_calibration(path, filter=filter)
+    if path.name == FIT:
+        return calibration_of(load_fit(path), str(path))
+    posterior = converged_posterior(path, "it is a prior")
+    folder = path.parent
+    if path.name == POSTERIOR and (folder / "run.json").exists():
+        run = RunDirectory(folder)
+        # without the errors found by the diagnostics the prior would be too narrow
+        run.require("prior_calibration", ("fit", "sample", "diagnose"))
+        fit = load_fit(folder / FIT)
+        diagnostics = load_diagnostics(run, fit, posterior)
+        hierarchy = hierarchy_of(fit, read_stored_fit(folder)["parts"])
+        posterior = with_diagnosed_errors(posterior, diagnostics, hierarchy)
+    return calibration_of(posterior, str(folder))

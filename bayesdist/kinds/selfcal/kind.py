@@ -3,34 +3,36 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from bayesdist.app.kinds.further_exposures import FurtherExposures
 from bayesdist.app.kinds.kind import EvaluationDomain, Outline, Questions, RunKind
 from bayesdist.app.run import Run
 from bayesdist.app.store.output import provenance_notes
+from bayesdist.assess.planning.futures import Schedule
+from bayesdist.assess.requirements.requirement import Requirement
 from bayesdist.infer import Posterior
+from bayesdist.infer.compare.planning import ExposureContent
 from bayesdist.kinds.selfcal.config import SelfcalConfig
-from bayesdist.kinds.selfcal.fit import fit_selfcal, load_selfcal, sample_detections
-from bayesdist.kinds.selfcal.further_exposures import DitheredExposures
+from bayesdist.kinds.selfcal.fit import SelfCalibrated, fit_selfcal, load_selfcal, sample_detections
+from bayesdist.kinds.selfcal.infer import SelfCalibrationMode
 from bayesdist.kinds.selfcal.inputs import (
     Inputs,
     outline_of_selfcal,
     read_selfcal,
     refuse_selfcal,
 )
-from bayesdist.kinds.selfcal.matched import load_matched_selfcal
-from bayesdist.kinds.selfcal.matching import match_dithers, selfcal_lines
-from bayesdist.kinds.selfcal.solved import SelfCalibrated
+from bayesdist.kinds.selfcal.matching import load_matched_selfcal, match_dithers, selfcal_lines
+from bayesdist.kinds.selfcal.patterns.dithers import further_dithers
 from bayesdist.report.words import Terminology
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.checks import Check
 
 if TYPE_CHECKING:
     from bayesdist.kinds.selfcal.report import SelfcalData
-
 
 DETECTED = Terminology(
     rows="detections",
@@ -130,7 +132,7 @@ class SelfcalKind(RunKind[SelfcalConfig, Inputs]):
 
     def save_diagnosed(self, run: Run) -> None:
         """Write the catalogue of the stars."""
-        from bayesdist.kinds.selfcal.stars import write_stars  # needed by one stage
+        from bayesdist.kinds.selfcal.fit import write_stars  # needed by one stage
 
         solved, directory = run.part(SelfCalibrated), run.directory
         notes = provenance_notes(run.posterior, solved.gauge_words)
@@ -176,6 +178,35 @@ class SelfcalKind(RunKind[SelfcalConfig, Inputs]):
         from bayesdist.kinds.selfcal.report import data_of_selfcal  # needed by one stage
 
         return data_of_selfcal(run)
+
+
+class DitheredExposures(FurtherExposures):
+    """Exposures of a self-calibration; each is informative about stars in other exposures only."""
+
+    dateless = (
+        "is a run of a self-calibration, whose exposures count as those at hand with their dates"
+    )
+
+    def __init__(self, run: Run, mode: SelfCalibrationMode) -> None:
+        super().__init__(run)
+        self.mode, self.gain = mode, mode.gain
+
+    @property
+    def count(self) -> int:
+        """Number of exposures of the run."""
+        return len(self.mode.problem.model.exposures)
+
+    def sentence(self, content: ExposureContent) -> str:
+        """Sentence on the exposures that are assumed."""
+        return f"Exposures are taken to be dithered as these {self.count} are, over the same stars."
+
+    def schedules(
+        self, requirement: Requirement, content: ExposureContent, epochs: Sequence[float]
+    ) -> list[Schedule]:
+        """One schedule, of the same dithers."""
+        information = self.gain * self.mode.distortion_information / self.count
+        further = further_dithers(self.mode, self.run.config.sampler.seed)
+        return [Schedule("dithered like these", information, together=further)]
 
 
 SELFCAL = SelfcalKind()

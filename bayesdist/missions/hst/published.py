@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from bayesdist.kinds.campaign.report.lines import Published, PublishedLine, publishes
+from bayesdist.kinds.campaign.report.linear_terms import Published, PublishedLine, publishes
 
 SOURCE = "ACS ISR 2015-06"
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from bayesdist.kinds.campaign import time_dependence
+from bayesdist.kinds.campaign import linear_terms
 from tests.app.support import edit, good
 
 # coarse nodes and few draws: quick.  Wider cells than the pattern's leave the linear terms alone;
@@ -37,14 +37,14 @@ def run(folder, full) -> Path:
     In full the course over time is told of the first term, and reported.  That of all would take
     long; tests/kinds/campaign/series shows what is said of it, tests/report what campaigns show.
     """
-    out, of_term = folder / "run_f606w", time_dependence._verdict
+    out, of_term = folder / "run_f606w", linear_terms._verdict
 
     def first(exposures, k, *options):
         unsaid = {"term": exposures.coefficients[k], "claim": "not asked", "text": "Not asked."}
         return of_term(exposures, k, *options) if full and k == 0 else unsaid
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(time_dependence, "_verdict", first)
+        patch.setattr(linear_terms, "_verdict", first)
         if not full:
             patch.setattr("bayesdist.app.stages.report", lambda run, pdf: [])
         good("run", folder / "campaign_f606w.toml", "-o", out, "-q")

@@ -28,9 +28,8 @@ from bayesdist.infer import load_fit, load_posterior
 from bayesdist.infer.exposures.shared_drift import drift_priors, with_drift_of
 from bayesdist.infer.nodes.fit import held_sigma
 from bayesdist.infer.solution.transforms import linear_terms, lines, reference_gauge, without_frames
-from bayesdist.kinds.campaign.filters import compare_filters
-from bayesdist.kinds.campaign.reference import held_tables
-from bayesdist.kinds.campaign.release import _require_alike
+from bayesdist.kinds.campaign.linear_terms import held_tables
+from bayesdist.kinds.campaign.release import _require_alike, compare_filters
 from bayesdist.kinds.campaign.series import Series, fit_series
 from bayesdist.missions.hst.simulate import acs_solution, making, read_acs, simulate_acs
 from bayesdist.model import LookupTable, TimeDependence, corrected

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from bayesdist.kinds.campaign.report import lines, lookup, matching, release, series  # noqa: F401
+from bayesdist.kinds.campaign.report import linear_terms, lookup, matching, release  # noqa: F401
 from bayesdist.kinds.campaign.report.data import CampaignData
 from bayesdist.report.contents import REPORT, Section
 

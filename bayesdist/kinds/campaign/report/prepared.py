@@ -15,7 +15,7 @@ from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.nodes import corrected_matches, inside_chips, pixel_shifts
 from bayesdist.infer.solution.linear import Rejection
 from bayesdist.kinds.campaign.inputs import Inputs
-from bayesdist.kinds.campaign.matched import affine_model_of, is_mirrored
+from bayesdist.kinds.campaign.matching import affine_model_of, is_mirrored
 from bayesdist.kinds.campaign.report.data import (
     CampaignData,
     CatalogStars,

@@ -18,7 +18,7 @@ from bayesdist.assess.maps import UncertaintyMap, uncertainty_map
 from bayesdist.data.detections import Detections
 from bayesdist.errors import InputError
 from bayesdist.infer.equations.priors import Prior
-from bayesdist.kinds.selfcal.infer.gauge import SAME_ROLL
+from bayesdist.kinds.selfcal.infer.gauge import POINTS, SAME_ROLL, functionals, moves
 from bayesdist.kinds.selfcal.infer.mode import (
     ExpectedSolution,
     SelfCalibrationMode,
@@ -31,7 +31,6 @@ from bayesdist.kinds.selfcal.infer.prior import (
     pointing_prior,
     tie,
 )
-from bayesdist.kinds.selfcal.infer.sky_moves import POINTS, functionals, moves
 from bayesdist.kinds.selfcal.patterns.exposures import (
     DitherPattern,
     dithered_model,

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from bayesdist.infer.equations.priors import Prior
-from bayesdist.kinds.selfcal.diagnose.correlated import selfcal_discrepancy
-from bayesdist.kinds.selfcal.diagnose.tests import selfcal_score_tests
+from bayesdist.kinds.selfcal.diagnose.tests import selfcal_discrepancy, selfcal_score_tests
 from bayesdist.kinds.selfcal.infer.mode import gauge_of, solve
 from bayesdist.kinds.selfcal.infer.problem import prepare
 from tests.kinds.selfcal.infer.fields import SIZE, field

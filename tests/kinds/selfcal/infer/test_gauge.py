@@ -10,9 +10,8 @@ import pytest
 from bayesdist.infer.equations.priors import Prior
 from bayesdist.kinds.selfcal.infer import pointing_prior, tie
 from bayesdist.kinds.selfcal.infer.elimination import Mixture, expand
-from bayesdist.kinds.selfcal.infer.gauge import find_gauge
+from bayesdist.kinds.selfcal.infer.gauge import POINTS, find_gauge, functionals, moves
 from bayesdist.kinds.selfcal.infer.mode import solve_in_gauge
-from bayesdist.kinds.selfcal.infer.sky_moves import POINTS, functionals, moves
 from tests.kinds.selfcal.infer.fields import field, problem_of
 
 ALWAYS = {*POINTS, "scale", "rotation"}

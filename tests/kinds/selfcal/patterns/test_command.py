@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
-from bayesdist.kinds.selfcal.patterns.config import PlanConfig, load_plan
+from bayesdist.kinds.selfcal.patterns.command import PlanConfig, load_plan
 from tests.app.support import REPOSITORY, good, refused
 from tests.docs_blocks import blocks
 from tests.test_docs import _configured

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from matplotlib.collections import QuadMesh
 
+from bayesdist.kinds.selfcal.patterns.command import pattern_maps
 from bayesdist.kinds.selfcal.patterns.dithers import (
     Camera,
     PlannedStars,
@@ -13,7 +14,6 @@ from bayesdist.kinds.selfcal.patterns.dithers import (
     compare_patterns,
 )
 from bayesdist.kinds.selfcal.patterns.exposures import DitherPattern, flat_coefficients
-from bayesdist.kinds.selfcal.patterns.figure import pattern_maps
 from bayesdist.model import Chip
 from bayesdist.report.drawing import png_of
 

@@ -14,10 +14,10 @@ from scipy import stats
 from bayesdist.app.store.output import write_table
 from bayesdist.data.sky import parallax_factors
 from bayesdist.infer import load_fit
+from bayesdist.kinds.selfcal.fit import star_table
 from bayesdist.kinds.selfcal.infer import star_catalogue
-from bayesdist.kinds.selfcal.infer.sky_moves import functionals
+from bayesdist.kinds.selfcal.infer.gauge import functionals
 from bayesdist.kinds.selfcal.patterns.exposures import pixels_of
-from bayesdist.kinds.selfcal.stars import star_table
 from tests.app.support import refused
 from tests.kinds.selfcal.infer.fields import SIZE, chips, field
 from tests.kinds.selfcal.runs.support import (

@@ -7,7 +7,7 @@ import pytest
 from astropy.table import Table
 
 from bayesdist.kinds.selfcal.diagnose.tests import selfcal_score_tests
-from bayesdist.kinds.selfcal.matched import FirstSolution
+from bayesdist.kinds.selfcal.matching import FirstSolution
 from tests.app.support import good
 from tests.kinds.selfcal.infer.wide import ARCSEC, MIDDLE, N, observed, on, tangent_plane
 from tests.kinds.selfcal.runs.support import fitted, write_selfcal

@@ -1,4 +1,4 @@
-"""The command `bayesdist init`."""
+"""Commands that only one kind of run has: init, plan-dither, release."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from bayesdist.app.commands.options import column_names, command, force
+from bayesdist.app.commands.options import column_names, command, force, new_folder
 
 
 @command(example="init camera.toml --matches stars.csv --size 2048 2048")
@@ -43,3 +43,38 @@ def init(config: str, matches: str | None, **options: Any) -> None:
     from bayesdist.kinds.matches.init import init as write_configuration
 
     click.echo(write_configuration(config, matches, **options))
+
+
+@command(
+    calls="bayesdist.kinds.selfcal.patterns.command:plan_patterns",
+    example="plan-dither patterns.toml",
+    recorded=True,
+    name="plan-dither",
+)
+@click.argument("path", metavar="PATTERNS.toml", type=click.Path())
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(),
+    metavar="DIR",
+    help="Folder to create for table, record and figure.",
+)
+def plan_dither() -> None:
+    """Compare dither patterns for a self-calibration, without data."""
+
+
+@command(
+    calls="bayesdist.kinds.campaign.release:release_runs",
+    example="release camera-run -o release",
+    recorded=True,
+)
+@click.argument("runs", nargs=-1, required=True, metavar="RUN...", type=click.Path())
+@new_folder
+@click.option(
+    "--allow-unconverged", is_flag=True, help="Also release runs that have not converged."
+)
+def release() -> None:
+    """Write one set of files from the runs of several filters.
+
+    The first run is that of the reference filter.
+    """
