@@ -12,6 +12,7 @@ from bayesdist.assess.model import with_shared_stars
 from bayesdist.assess.terms.parameters import CATALOGUE as POSITIONS
 from bayesdist.assess.terms.parameters import MOTIONS, catalogue_terms
 from bayesdist.data import Matches, ReferenceCatalog
+from bayesdist.data.sky import parallax_factors
 from bayesdist.diagnose.diagnostics import catalogue_covariance
 from bayesdist.infer import Posterior, Rejection, fit_linear
 from bayesdist.infer.stars.likelihood import OutlierMixture
@@ -21,6 +22,7 @@ from bayesdist.model import Chip, DistortionModel
 
 STARS, EXPOSURES = 60, 9
 CENTROID, CATALOGUE = 0.02, 0.05
+UNLIMITED = Rejection(1e9, None)
 MODEL = DistortionModel(2, (Chip(1, "A", (4096.0, 2048.0), (2048.0, 1024.0)),))
 
 
@@ -50,7 +52,7 @@ def catalog():
 
 @pytest.fixture(scope="module")
 def fit(matches):
-    return fit_linear(matches, MODEL, rejection=Rejection(1e9, None))
+    return fit_linear(matches, MODEL, rejection=UNLIMITED)
 
 
 def posterior_of(fit, n=1000, wider=1.0, seed=1):
@@ -145,35 +147,56 @@ def test_the_scale_changes_while_an_exposure_lasts(exptime):
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
-def test_errors_of_stars_are_within_those_of_their_positions_with_parallax(rng, mirrored):
-    """Of a catalogue with all correlations, at any date, whatever the parallax factors are."""
+def test_errors_of_stars_are_those_of_their_positions_with_parallax(rng, mirrored):
+    """Of a catalogue with all correlations, at any date."""
     n = 30
     root = rng.standard_normal((n, 5, 5))
     C = root @ np.swapaxes(root, 1, 2)
     sigma = np.sqrt(np.einsum("nii->ni", C))
     names = ("sigma_u", "sigma_v", "sigma_parallax", "sigma_pm_u", "sigma_pm_v")
-    zero = np.zeros(n)
+    zero, point = np.zeros(n), (40.0, -20.0)
     catalog = ReferenceCatalog(
         zero, zero, pm_u=zero, pm_v=zero, parallax=zero, epoch=2016.0, unit="mas",
-        tangent_point=(0.0, 0.0), star=2 * np.arange(n),
+        tangent_point=point, star=2 * np.arange(n),
         correlations=C / (sigma[:, :, None] * sigma[:, None]),
         **dict(zip(names, sigma.T, strict=True)),
     )  # fmt: skip
-    errors = errors_by_star(catalog, mirrored=mirrored)
     sign = np.array([-1.0 if mirrored else 1.0, 1.0])
-    for epoch in (2000.0, 2016.0, 2030.5):
-        dt, (east, north) = epoch - 2016.0, rng.uniform(-1, 1, 2)
-        A = np.array([[1, 0, east, dt, 0], [0, 1, north, 0, dt]])
-        whole = np.outer(sign, sign) * (A @ C @ A.T)
-        part = errors.covariances_at(catalog.star, np.full(n, epoch))
-        left = np.linalg.eigvalsh(whole - part)
-        # the parallax is one number: what it adds lies on a line
-        np.testing.assert_allclose(left[:, 0], 0.0, atol=1e-9 * np.abs(whole).max())
-    # nothing is taken off where parallaxes are independent of the other errors
     free = catalog.correlations.copy()
     free[:, 2] = free[:, :, 2] = np.eye(5)[2]
-    part = errors_by_star(replace(catalog, correlations=free)).covariances_at(
-        catalog.star, np.full(n, 2020.0)
-    )
-    A = np.array([[1, 0, 0, 4, 0], [0, 1, 0, 0, 4]])
-    np.testing.assert_allclose(part, A @ C @ A.T, rtol=1e-9)
+    own = C.copy()
+    own[:, 2, [0, 1, 3, 4]] = own[:, [0, 1, 3, 4], 2] = 0.0
+    none = np.where(np.eye(5), C, 0.0)
+    for stars_, expected in (
+        (catalog, C),
+        (replace(catalog, correlations=free), own),
+        (replace(catalog, correlations=None), none),
+    ):
+        errors = errors_by_star(stars_, mirrored=mirrored)
+        for epoch in (2000.0, 2016.0, 2030.5):
+            dt, (east, north) = epoch - 2016.0, parallax_factors(epoch, *point)[0]
+            A = np.array([[1, 0, east, dt, 0], [0, 1, north, 0, dt]])
+            part = errors.covariances_at(catalog.star, np.full(n, epoch))
+            np.testing.assert_allclose(part, np.outer(sign, sign) * (A @ expected @ A.T), rtol=1e-9)
+
+
+def test_exposures_of_one_season_do_not_help_against_parallaxes(matches, catalog):
+    """Closed form: the displacement by a parallax is the same in all exposures of a date."""
+    sigma, point, epoch = 0.075, (40.0, -20.0), 2005.3
+    zero = np.zeros(STARS)
+    seen = replace(
+        catalog, pm_u=zero, pm_v=zero, sigma_pm_u=zero, sigma_pm_v=zero, parallax=zero,
+        sigma_parallax=np.full(STARS, sigma), epoch=epoch, unit="mas", tangent_point=point,
+    )  # fmt: skip
+    factors = parallax_factors(epoch, *point)[0]
+    common = CATALOGUE**2 * np.eye(2) + sigma**2 * np.outer(factors, factors)
+    each = np.tile(common + CENTROID**2 * np.eye(2), (len(matches), 1, 1))
+    dated = matches.with_columns(epoch=np.full(len(matches), epoch)).with_covariances(each)
+    fit = fit_linear(replace(dated, unit="mas"), replace(MODEL, unit="mas"), rejection=UNLIMITED)
+    found = catalogue_covariance(fit, replace(dated, unit="mas"), errors_by_star(seen))
+    phi = MODEL.basis().evaluate(*stars())
+    inverse = np.linalg.inv(phi.T @ phi)
+    unit = CATALOGUE**2 * np.abs(inverse).max()
+    np.testing.assert_allclose(found.total, np.kron(common, inverse), atol=1e-6 * unit)
+    counted = np.kron(common, inverse) / EXPOSURES
+    np.testing.assert_allclose(found.counted, counted, atol=1e-6 * unit)

@@ -89,7 +89,7 @@ def field(
         np.full((n_stars, 2), POSITION), np.full((n_stars, 2), MOTION), np.full(n_stars, DATE)
     )
     moved = np.einsum(
-        "ln,lna->na",
+        "lan,lna->na",
         errors.levers(star, epoch),
         (np.array([POSITION, MOTION])[:, None, None] * rng.standard_normal((2, n_stars, 2)))[
             :, star

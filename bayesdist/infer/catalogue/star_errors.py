@@ -9,8 +9,9 @@ covariance Sigma_s of each star s cause the covariance
 
 of the parameters.  H is the normal matrix, and i are the matches of star s, with the weights W_i
 and the derivatives J_i of the position with respect to the parameters.  a_i is the derivative of
-the match's position with respect to the error: 1 for a position, t - t0 for a proper motion.  The
-covariance of the fit already includes the diagonal part, sum_i instead of (sum_i)^2.
+the match's position with respect to the error: 1 for a position, t - t0 for a proper motion, and
+the factors along u and v for a parallax.  The covariance of the fit already includes the diagonal
+part, sum_i instead of (sum_i)^2.
 
 An error c_s of star s changes the parameters theta by H^-1 G_s c_s.  If the star is observed in
 another exposure that was not part of the fit, its error is therefore correlated with that of the
@@ -19,7 +20,7 @@ solution: cov(c_s, theta) = Sigma_s (H^-1 G_s)^T.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -51,15 +52,23 @@ class StarErrors:
     epoch : ndarray, shape (S,), optional
         Dates (decimal years) of the positions; required with `motion`. Without `correlations`, the
         errors of position and proper motion are uncorrelated at this date.
-    correlations : ndarray, shape (S, 2, 2) or (S, 4, 4), optional
-        Correlation matrices of the errors in u and v and, with `motion`, of the proper motions in u
-        and v. By default all errors are independent.
+    correlations : ndarray, shape (S, 2, 2), (S, 4, 4) or (S, 5, 5), optional
+        Correlation matrices of the errors in u and v, with `motion` of the proper motions in u and
+        v, and with `parallax` of the parallaxes. By default all errors are independent.
+    parallax : ndarray, shape (S,), optional
+        Standard errors of the parallaxes, in the unit of u, v. They need `motion`, `correlations`
+        and `factors`.
+    factors : callable, optional
+        ``factors(epoch)`` returns the parallax factors (n, 2) along u and v at dates (n,) in
+        decimal years.
     """
 
     position: Float
     motion: Float | None = None
     epoch: Float | None = None
     correlations: Float | None = None
+    parallax: Float | None = None
+    factors: Callable[[Float], Float] | None = None
 
     @classmethod
     def contained_in(cls, matches: Matches) -> StarErrors:
@@ -104,36 +113,51 @@ class StarErrors:
 
         Returns
         -------
-        ndarray, shape (1, n) or (2, n)
-            1 for the position and, if proper motions have errors, years since the catalogue epoch.
+        ndarray, shape (levers, 2, n)
+            Along u and v: 1 for the position; if proper motions have errors, years since the
+            catalogue epoch; and if parallaxes have errors, their factors.
         """
-        ones = np.ones(len(star))
+        ones = np.ones((2, len(star)))
         if self.motion is None or self.epoch is None or epoch is None:
             return ones[None]
-        return np.stack([ones, epoch - self.epoch[star]])
+        levers = [ones, (epoch - self.epoch[star]) * ones]
+        if self.parallax is not None and self.factors is not None:
+            dates, of_match = np.unique(epoch, return_inverse=True)
+            levers.append(self.factors(dates)[of_match].T)
+        return np.stack(levers)
+
+    @property
+    def n_levers(self) -> int:
+        """Number of errors of a star that matches share on each axis: 1, 2 or 3; see `levers`."""
+        return len(self._sigmas)
 
     @property
     def variances(self) -> Float:
-        """Variances (1 or 2, S, 2) of the positions and, if given, of the proper motions."""
+        """Variances (levers, S, 2) of positions and, if given, of motions and of parallaxes."""
         return np.asarray(np.stack(self._sigmas) ** 2)
 
     @property
     def _sigmas(self) -> list[Float]:
-        """Standard errors (S, 2) of the positions and, if given, of the proper motions."""
-        return [self.position] if self.motion is None else [self.position, self.motion]
+        """Standard errors (S, 2) of positions and, if given, of motions and of parallaxes."""
+        if self.motion is None:
+            return [self.position]
+        if self.parallax is None:
+            return [self.position, self.motion]
+        return [self.position, self.motion, np.tile(self.parallax[:, None], 2)]
 
     def covariances(self, star: Int, n_levers: int) -> Float:
-        """Covariances (n, levers, 2, levers, 2) of positions and, with two levers, of motions.
+        """Covariances (n, levers, 2, levers, 2) of positions, motions and parallaxes.
 
-        The second and the last axis are the lever (see `levers`), the others u and v.  `star` (n,)
-        are star codes.
+        The second and the fourth axis are the lever (see `levers`), the others u and v.  A parallax
+        has the same error on both axes.  `star` (n,) are star codes.
         """
         sigma = np.stack([values[star] for values in self._sigmas[:n_levers]], axis=1)
         m = 2 * n_levers
         if self.correlations is None:
             out = np.broadcast_to(np.eye(m), (len(star), m, m))
         else:
-            out = self.correlations[star, :m, :m]
+            parameters = np.minimum(np.arange(m), 4)  # the parallax stands for both axes
+            out = self.correlations[star][:, parameters[:, None], parameters]
         out = out.reshape(len(star), n_levers, 2, n_levers, 2)
         return np.asarray(out * sigma[:, :, :, None, None] * sigma[:, None, None])
 
@@ -144,7 +168,7 @@ class StarErrors:
         """
         levers = self.levers(star, epoch)
         covariances = self.covariances(star, len(levers))
-        return np.asarray(np.einsum("ln,nlamb,mn->nab", levers, covariances, levers))
+        return np.asarray(np.einsum("lan,nlamb,mbn->nab", levers, covariances, levers))
 
     def at(self, star: Int, epoch: Float | None) -> Float:
         """Variances of the catalogue positions at the dates of the matches.
@@ -164,22 +188,33 @@ class StarErrors:
             return np.einsum("naa->na", self.covariances_at(star, epoch))
         levers = self.levers(star, epoch)
         variances = self.variances[: len(levers), star]
-        return np.asarray(np.einsum("ln,lna->na", levers**2, variances))
+        return np.asarray(np.einsum("lan,lna->na", levers**2, variances))
 
     def checked(self, n_stars: int) -> StarErrors:
         """Errors of the first `n_stars` stars, validated.
 
         Raises InputError if there are fewer stars, values are not finite or negative, correlations
-        are impossible, or the epoch is missing.
+        are impossible, or the epoch, or what errors of parallaxes need, is missing.
         """
         position = _checked(self.position, n_stars, "position")
-        if self.motion is None or not self.motion.any():
+        if self.parallax is not None and (
+            self.motion is None or self.correlations is None or self.factors is None
+        ):
+            raise InputError(
+                "errors of parallaxes are given without what they need",
+                do="give motion, correlations and factors",
+            )
+        if self.motion is None or not (self.motion.any() or self.parallax is not None):
             return StarErrors(position, correlations=_possible(self.correlations, n_stars, 2))
         if self.epoch is None:
             raise InputError("errors of proper motions need the catalogue's epoch", do="give it")
         motion = _checked(self.motion, n_stars, "motion")
         epoch = _checked(self.epoch, n_stars, "epoch", signed=True)
-        return StarErrors(position, motion, epoch, _possible(self.correlations, n_stars, 4))
+        if self.parallax is None:
+            return StarErrors(position, motion, epoch, _possible(self.correlations, n_stars, 4))
+        parallax = _checked(self.parallax, n_stars, "parallax")
+        matrices = _possible(self.correlations, n_stars, 5)
+        return StarErrors(position, motion, epoch, matrices, parallax, self.factors)
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,8 +229,8 @@ class StarCovariance:
         Part that the covariance of the solution already includes, because it treats the errors of
         all matches as independent.
     motions : ndarray, shape (D, D), optional
-        Part of `total` caused by the errors of the proper motions, and by what the errors of the
-        positions have in common with them; None if proper motions have no errors.
+        Part of `total` caused by the errors of the proper motions, and by what the errors of
+        positions and parallaxes have in common with them; None if proper motions have no errors.
     """
 
     total: Float
@@ -260,7 +295,7 @@ def star_covariance(
     _require_contained(matches, code, errors)
     stars, order = prepare(solution.model, matches)
     used = solution.uses(matches)[order]
-    sums = StarSums.weighted(stars, code[order], list(levers[:, order]), used.astype(float))
+    sums = StarSums.weighted(stars, code[order], list(levers[..., order]), used.astype(float))
     cov, mean = np.asarray(solution.cov, float), np.asarray(solution.mean)
     D = solution.model.n_params if frames else solution.model.n_distortion
     influence = influence_by_group(solution.model, mean, stars.groups, cov, D)
@@ -367,11 +402,10 @@ class StarInfluence:
         by = self.by[: len(levers)][:, :, at]
         if self.errors.correlations is not None:
             covariances = self.errors.covariances(star, len(levers))
-            out[common] = np.einsum("ln,nlamb,mbnd->nad", levers, covariances, by, optimize=True)
+            out[common] = np.einsum("lan,nlamb,mbnd->nad", levers, covariances, by, optimize=True)
             return out
         variances = self.errors.variances[: len(levers), star]
-        weight = levers[..., None] * variances  # (levers, n, 2)
-        out[common] = np.einsum("lna,land->nad", weight, by)
+        out[common] = np.einsum("lan,lna,land->nad", levers, variances, by)
         return out
 
 
@@ -386,8 +420,7 @@ def star_influence(
     """
     code = matches.column("star")
     model, D = fit.model, fit.model.n_distortion
-    n_levers = 1 if errors.motion is None else 2
-    by = np.zeros((n_levers, 2, len(codes), D))
+    by = np.zeros((errors.n_levers, 2, len(codes), D))
     wanted = np.isin(code, codes) & fit.uses(matches)
     if not wanted.any():
         return StarInfluence(errors, codes, by)
@@ -438,8 +471,8 @@ class StarSums:
     code: Int  # star (N,) of each match
     phi: list[Float]  # basis functions (n_g, K) of each group
     weight: Float  # weights (2, N) of both axes
-    # derivatives (N,) of the match's position with respect to an error of the star: 1 for its
-    # position and, if proper motions have errors, years
+    # derivatives (2, N) of the match's position along u and v with respect to each error of the
+    # star; see `StarErrors.levers`
     levers: list[Float]
     order: Int  # index (N,) of each match in the stars that it was taken from
     cross: Float | None = None  # off-diagonal weight (N,) between u and v
@@ -456,7 +489,7 @@ class StarSums:
         """Sort matches by group and star.
 
         The matches are in the order of `stars`.  `code` (N,) are their star codes; see the class
-        for `weight`, `levers` and `cross`.
+        for `weight`, `levers` and `cross`; levers of shape (N,) are those of both axes.
         """
         bounds = [slice(a, b) for a, b in zip(stars.starts[:-1], stars.starts[1:], strict=True)]
         order = np.concatenate(
@@ -474,7 +507,7 @@ class StarSums:
             code[order],
             phi,
             weight[:, order],
-            [lever[order] for lever in levers],
+            [np.broadcast_to(lever, weight.shape)[:, order] for lever in levers],
             order,
             None if cross is None else cross[order],
         )
@@ -509,7 +542,8 @@ class StarSums:
                 if self.cross is not None:
                     pull += (phi[lo:hi] * self.cross[rows, None]) @ influence[g][1 - axis]
                 for c, lever in enumerate(self.levers):
-                    moved = pull if c == 0 else pull * lever[rows, None]  # the first lever is 1
+                    # the first lever is 1
+                    moved = pull if c == 0 else pull * lever[axis, rows, None]
                     if repeated:
                         moved = np.add.reduceat(moved, new, axis=0)
                     out[c, axis, at[new]] += moved
@@ -538,26 +572,30 @@ class StarSums:
     def shared_correlated(
         self, influence: list[Float], errors: StarErrors, scratch: int = SCRATCH
     ) -> Float:
-        """Covariances (levers, D, D) from correlated errors that the matches of a star share.
+        """Covariances (1 or 2, D, D) from correlated errors that the matches of a star share.
 
-        With two levers the second is that of the motions, and of what the positions have in common
-        with them: the first is that of the positions at the date when both are uncorrelated.
-        Stars are processed in chunks, as in `shared`.
+        The second is that of the motions, if they have errors, and of what positions and parallaxes
+        have in common with them: the first is that of the positions at the date when both are
+        uncorrelated, and of the parallaxes.  Stars are processed in chunks, as in `shared`.
         """
         D, n_stars, n_levers = influence[0].shape[2], len(errors.position), len(self.levers)
-        out = np.zeros((n_levers, D, D))
+        out = np.zeros((min(n_levers, 2), D, D))
+        still, moving = np.r_[0:2, 4 : 2 * n_levers], np.arange(2, 4)
         step = max(1, scratch // (32 * D * n_levers))
         for first in range(0, n_stars, step):
             codes = np.arange(first, min(first + step, n_stars))
             sums = self.each(influence, first, first + len(codes))
             flat = np.moveaxis(sums, 2, 0).reshape(len(codes), 2 * n_levers, D)
             total = errors.covariances(codes, n_levers).reshape(-1, 2 * n_levers, 2 * n_levers)
-            positions, mixed = total[:, :2, :2], total[:, :2, 2:]
-            if n_levers == 2:
-                gain = mixed @ np.linalg.pinv(total[:, 2:, 2:], hermitian=True)
-                positions = positions - gain @ np.swapaxes(mixed, 1, 2)
-                out[1] += _summed(flat, total)
-            out[0] += _summed(flat[:, :2], positions)
+            if n_levers == 1:
+                out[0] += _summed(flat, total)
+                continue
+            mixed = total[:, still[:, None], moving]
+            motions = total[:, moving[:, None], moving]
+            gain = mixed @ np.linalg.pinv(motions, hermitian=True)
+            rest = total[:, still[:, None], still] - gain @ np.swapaxes(mixed, 1, 2)
+            out[0] += _summed(flat[:, still], rest)
+            out[1] += _summed(flat, total)
         out[1:] -= out[0]
         return out
 
@@ -590,7 +628,7 @@ class StarSums:
             rows = slice(self.starts[g], self.starts[g + 1])
             variance = [
                 sum(
-                    lever[rows] ** 2 * v[self.code[rows], axis]
+                    lever[axis, rows] ** 2 * v[self.code[rows], axis]
                     for lever, v in zip(self.levers, variances, strict=True)
                 )
                 for axis in (0, 1)

@@ -27,7 +27,7 @@ from bayesdist.data import (
 from bayesdist.data.covariances import without_sizes
 from bayesdist.data.matching.reports import check_campaign
 from bayesdist.data.preparing import refuse_strangers
-from bayesdist.data.sky import mean_direction, tangent_plane
+from bayesdist.data.sky import mean_direction, parallax_factors, tangent_plane
 from bayesdist.errors import ConfigError, DegenerateError, InputError
 from bayesdist.files.tables import read_table
 from bayesdist.infer.catalogue.star_errors import StarErrors
@@ -246,8 +246,8 @@ def errors_by_star(
 
     `largest_vafactor` is the factor that catalogue positions were divided by, and `mirrored` is
     True if u of the matches has the opposite sign to that of the catalogue.  A star in several
-    exposures has one error, because the factors differ by less than 1e-4.  Errors of parallaxes,
-    and what other errors have in common with them, are taken as errors of single exposures.
+    exposures has one error, because the factors differ by less than 1e-4.  Errors of parallaxes
+    grow with their factors at the middle of the field, as in `ReferenceCatalog.as_seen`.
     """
     position = catalog.by_code("sigma_u", "sigma_v")
     if position is None or not position.any():
@@ -255,25 +255,27 @@ def errors_by_star(
     motion = catalog.by_code("sigma_pm_u", "sigma_pm_v")
     epoch = catalog.by_code("epoch")
     dates = None if epoch is None else epoch[:, 0]
-    if catalog.correlations is None:
+    point = catalog.tangent_point
+    sigma_parallax = None if catalog.parallax is None or dates is None else catalog.sigma_parallax
+    seen = point is not None and sigma_parallax is not None and bool(sigma_parallax.any())
+    if catalog.correlations is None and not seen:
         motion = None if motion is None else motion / largest_vafactor
         return StarErrors(position / largest_vafactor, motion, dates)
-    sigma, correlations = without_sizes(_without_parallax(catalog.covariances))
-    n = 2 if motion is None else 4
+    n = 5 if seen else 2 if motion is None else 4
+    sigma, correlations = without_sizes(catalog.covariances)
+    parameters = np.array([0, 1, 3, 4, 2])[:n]
     sigmas, matrices = np.zeros((len(position), n)), np.tile(np.eye(n), (len(position), 1, 1))
-    sigmas[catalog.star] = sigma[:, :n] / largest_vafactor
-    sign = np.array([-1.0 if mirrored else 1.0, 1.0] * (n // 2))
-    matrices[catalog.star] = correlations[:, :n, :n] * np.outer(sign, sign)
-    return StarErrors(sigmas[:, :2], sigmas[:, 2:] if n == 4 else None, dates, matrices)
+    sigmas[catalog.star] = sigma[:, parameters] / largest_vafactor
+    sign = np.array([-1.0 if mirrored else 1.0, 1.0] * 2 + [1.0])[:n]
+    matrices[catalog.star] = correlations[:, parameters[:, None], parameters] * np.outer(sign, sign)
+    errors = StarErrors(sigmas[:, :2], sigmas[:, 2:4] if n > 2 else None, dates, matrices)
+    if not seen or point is None:
+        return errors
 
+    def factors(epoch: Float) -> Float:
+        return parallax_factors(epoch, *point) * sign[:2]
 
-def _without_parallax(covariances: Float) -> Float:
-    """Covariances (N, 4, 4) of positions and motions, without what parallaxes explain of them."""
-    rest = np.array([0, 1, 3, 4])
-    with_parallax, variance = covariances[:, rest, 2], covariances[:, 2, 2]
-    explained = with_parallax / np.sqrt(np.where(variance > 0, variance, np.inf))[:, None]
-    out = covariances[:, rest[:, None], rest] - explained[:, :, None] * explained[:, None]
-    return np.asarray(out)
+    return replace(errors, parallax=sigmas[:, 4], factors=factors)
 
 
 def refuse_campaign(inputs: Inputs) -> None:

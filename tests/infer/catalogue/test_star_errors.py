@@ -62,16 +62,27 @@ def fitted(matches, model):
     return fit_linear(matches, model, priors=priors, rejection=Rejection(clip_chi2=4.0))
 
 
-def correlated(seed=1):
+def factors(epoch):
+    """Displacements along u and v by parallaxes, a year long and of different size."""
+    phase = 2 * np.pi * np.asarray(epoch)
+    return np.stack([np.cos(phase), 0.4 * np.sin(phase)], axis=1)
+
+
+def correlated(seed=1, *, parallax=False):
     """The same, with correlations of positions and motions, and of the remaining errors."""
     model, matches, _, code, catalogue = some(seed)
     rng = np.random.default_rng([seed, 46])
-    root = rng.standard_normal((len(catalogue.position), 4, 4))
+    n, n_stars = 5 if parallax else 4, len(catalogue.position)
+    root = rng.standard_normal((n_stars, n, n))
     cov = root @ np.swapaxes(root, 1, 2)
     size = 1 / np.sqrt(np.einsum("nii->ni", cov))
     catalogue = replace(catalogue, correlations=cov * size[:, :, None] * size[:, None])
+    if parallax:
+        sizes = rng.uniform(0.0, 0.03, n_stars)
+        catalogue = replace(catalogue, parallax=sizes, factors=factors)
     S = joint_covariances(catalogue)[code]
-    A = np.zeros((len(code), 2, 4))
+    A = np.zeros((len(code), 2, n))
+    A[:, :, 4:] = factors(matches.epoch)[:, :, None]
     A[:, [0, 1], [0, 1]] = 1.0
     A[:, [0, 1], [2, 3]] = (matches.epoch - catalogue.epoch[code])[:, None]
     root = rng.normal(0.0, 0.03, (len(code), 2, 2))
@@ -81,8 +92,10 @@ def correlated(seed=1):
 
 
 def joint_covariances(catalogue):
-    """Covariances (S, 4, 4) of u, v and the motions in both."""
+    """Covariances (S, 4, 4) or (S, 5, 5) of u, v, the motions in both, and parallaxes."""
     sigma = np.hstack([catalogue.position, catalogue.motion])
+    if catalogue.parallax is not None:
+        sigma = np.column_stack([sigma, catalogue.parallax])
     return catalogue.correlations * sigma[:, :, None] * sigma[:, None]
 
 
@@ -91,16 +104,17 @@ def dense_correlated(fit, matches, code, S, A, weight):
     J = fit.model.jacobian(fit.mean, matches.x, matches.y, **columns_of(matches))
     W = weight[:, None, None] * np.linalg.inv(matches.covariances())
     response = np.einsum("pq,naq,nab->pnb", fit.cov, J, W)
-    by_star = np.zeros((len(fit.cov), len(S), 4))
+    by_star = np.zeros((len(fit.cov), *S.shape[:2]))
     np.add.at(by_star.transpose(1, 0, 2), code, np.einsum("pnb,nbk->npk", response, A))
     total = np.einsum("psk,skl,qsl->pq", by_star, S, by_star)
     each = A @ S[code] @ np.swapaxes(A, 1, 2)
     return total, np.einsum("pna,nab,qnb->pq", response, each, response)
 
 
+@pytest.mark.parametrize("parallax", [False, True])
 @pytest.mark.parametrize("scratch", [64_000_000, 32 * 100 * 14])
-def test_with_correlations_it_is_the_dense_formula(scratch):
-    matches, fit, code, catalogue, A = correlated()
+def test_with_correlations_it_is_the_dense_formula(scratch, parallax):
+    matches, fit, code, catalogue, A = correlated(parallax=parallax)
     used = fit.uses(matches)
     found = star_covariance(fit, matches.with_columns(star=code), catalogue, scratch=scratch)
     S = joint_covariances(catalogue)
@@ -109,17 +123,17 @@ def test_with_correlations_it_is_the_dense_formula(scratch):
     np.testing.assert_allclose(found.total / unit, total / unit, atol=1e-9)
     np.testing.assert_allclose(found.counted / unit, counted / unit, atol=1e-9)
     # positions as they were at the date when they and the motions were independent
-    still = S.copy()
-    still[:, :2, :2] -= S[:, :2, 2:] @ np.linalg.solve(S[:, 2:, 2:], S[:, 2:, :2])
-    still[:, 2:] = still[:, :, 2:] = 0.0
+    still = S - S[:, :, 2:4] @ np.linalg.solve(S[:, 2:4, 2:4], S[:, 2:4, :])
+    still[:, 2:4] = still[:, :, 2:4] = 0.0
     alone, _ = dense_correlated(fit, matches, code, still, A, used.astype(float))
     np.testing.assert_allclose((found.total - found.motions) / unit, alone / unit, atol=1e-9)
     assert np.linalg.eigvalsh(found.motions / unit).min() > -1e-9
 
 
-def test_the_influence_of_stars_has_their_correlations():
+@pytest.mark.parametrize("parallax", [False, True])
+def test_the_influence_of_stars_has_their_correlations(parallax):
     """Of stars in another exposure: sum of Sigma_s (H^-1 G_s)^T over positions and motions."""
-    matches, fit, code, catalogue, A = correlated(2)
+    matches, fit, code, catalogue, A = correlated(2, parallax=parallax)
     codes = np.unique(code)[::2]
     found = star_influence(fit, matches.with_columns(star=code), catalogue, codes)
     J = fit.model.jacobian(fit.mean, matches.x, matches.y, **columns_of(matches))
@@ -129,7 +143,8 @@ def test_the_influence_of_stars_has_their_correlations():
     for star, epoch in ((codes[3], 2001.5), (codes[5], 2009.0)):
         G = response[code == star].sum(axis=0)[:D]
         lever = epoch - catalogue.epoch[star]
-        expected = np.hstack([np.eye(2), lever * np.eye(2)]) @ S[star] @ G.T
+        levers = [np.eye(2), lever * np.eye(2), *([factors([epoch]).T] if parallax else [])]
+        expected = np.hstack(levers) @ S[star] @ G.T
         given = found.with_solution(np.array([star]), np.array([epoch]))[0]
         np.testing.assert_allclose(given, expected, atol=1e-9 * np.abs(expected).max())
 
