@@ -18,7 +18,7 @@ from astropy.table import Table
 from astropy.wcs import WCS
 
 from bayesdist.app.cli import main
-from bayesdist.simulate.matches import camera
+from bayesdist.simulate import camera
 from tests.reduced import only_in_full
 
 from .docs_blocks import run_page

@@ -12,7 +12,7 @@ import bayesdist as bd
 from bayesdist.formats import read_sip, sip_from_solution, write_sip
 from bayesdist.missions.wise import simulate_wise
 from bayesdist.model import PolynomialBasis
-from bayesdist.simulate.matches import camera, matched_to_gaia
+from bayesdist.simulate import camera, matched_to_gaia
 from tests.app.support import as_table
 
 from .docs_blocks import blocks

@@ -29,8 +29,8 @@ from bayesdist.report.html import (
     summary_html,
     summary_text,
 )
-from bayesdist.utils.numbers import number, with_mas
 from bayesdist.utils.quantities import Number, Random, value_in, values_in, year_of
+from bayesdist.utils.text import number, with_mas
 
 if TYPE_CHECKING:
     from astropy.coordinates import SkyCoord

@@ -14,7 +14,7 @@ from bayesdist.app.store.made_from import places_of
 from bayesdist.app.store.output import atomic_directory
 from bayesdist.app.store.refusals import refuse_other_inputs
 from bayesdist.app.store.rundir import RunDirectory
-from bayesdist.data.formats.files import write_matches
+from bayesdist.data.formats import write_matches
 
 MATCHES_FILE = "matches.h5"  # stars of a run that was made in memory
 # stages of a run in memory that are saved; products are made from them

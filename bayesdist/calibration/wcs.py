@@ -24,7 +24,6 @@ from bayesdist.infer.solution.solution import LinearMap
 from bayesdist.infer.solution.transforms import at_exposure
 from bayesdist.plugin import load_object
 from bayesdist.utils.arrays import Bool, Float
-from bayesdist.utils.numbers import number
 from bayesdist.utils.quantities import (
     Direction,
     Epoch,
@@ -36,6 +35,7 @@ from bayesdist.utils.quantities import (
     whole_number,
     year_of,
 )
+from bayesdist.utils.text import number
 
 if TYPE_CHECKING:
     from astropy.modeling import Model

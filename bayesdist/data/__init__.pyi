@@ -12,7 +12,7 @@ from .exposures import (
     read_exposures as read_exposures,
     write_exposures as write_exposures,
 )
-from .formats.files import (
+from .formats import (
     FORMATS as FORMATS,
     MatchFormat as MatchFormat,
     input_files as input_files,

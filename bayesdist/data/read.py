@@ -12,7 +12,7 @@ from typing import Any, Unpack
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.data.formats.files import (
+from bayesdist.data.formats import (
     CORR_COLUMNS,
     FORMATS,
     exposure_names,

@@ -27,7 +27,7 @@ from scipy.spatial import cKDTree
 
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Float, Int
-from bayesdist.utils.numbers import count
+from bayesdist.utils.text import count
 
 # interpretation of rows with equal reference positions: reading option `same_position`
 SAME_POSITION = ("one_star", "separate_stars")

@@ -12,7 +12,7 @@ from astropy.table import Table
 
 from bayesdist.data.covariances import without_sizes
 from bayesdist.data.detections import Detections
-from bayesdist.data.formats.files import exposure_names, input_files, kind_of, mission_formats
+from bayesdist.data.formats import exposure_names, input_files, kind_of, mission_formats
 from bayesdist.data.reading.centroids import check_ellipses, pixel_covariances, with_variances
 from bayesdist.data.reading.columns import CENTROIDS
 from bayesdist.data.repeated import first_duplicate

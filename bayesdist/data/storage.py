@@ -32,7 +32,7 @@ from bayesdist.data.columns import (
     common_radius,
     recoded,
 )
-from bayesdist.data.formats.files import exposure_names, input_files
+from bayesdist.data.formats import exposure_names, input_files
 from bayesdist.data.matches import Matches
 from bayesdist.data.output import geometry_header, header_arguments
 from bayesdist.data.reading.centroids import ellipse_columns

@@ -17,18 +17,20 @@ from bayesdist.diagnose.score.result import ScoreTest
 from bayesdist.infer import LinearFit
 from bayesdist.infer.exposures.frame_choice import frames_that_help
 from bayesdist.infer.posterior.checks import fit_checks, pixel_doubt
-from bayesdist.utils.checks import EITHER, LARGER, Check
-from bayesdist.utils.limits import (
+from bayesdist.utils.checks import (
     CHI2_TOO_LARGE,
+    EITHER,
     EXPOSURE_CHI2,
     HELD_OUT_DOUBTFUL,
+    LARGER,
     MATCH_RADIUS,
     STRUCTURE,
     STRUCTURE_IN_BUDGET,
     STRUCTURE_SEEN,
+    Check,
 )
-from bayesdist.utils.limits import SCORE_TESTS as SCORE_LIMIT
-from bayesdist.utils.numbers import count, number, percent, probability, size_of
+from bayesdist.utils.checks import SCORE_TESTS as SCORE_LIMIT
+from bayesdist.utils.text import count, number, percent, probability, size_of
 
 FIT, HELD_OUT, SCORE_TESTS = "Fit", "Held-out truth", "Score tests"
 MATCHING, ASSUMPTIONS = "Matching", "Assumptions"

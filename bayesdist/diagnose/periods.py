@@ -28,9 +28,9 @@ from bayesdist.infer.compare.periods import (
 )
 from bayesdist.infer.stars.stars import prepare
 from bayesdist.utils.arrays import Float, Int
+from bayesdist.utils.checks import DIFFERENCE
 from bayesdist.utils.distributions import chi2_isf, chi2_sf, f_sf
-from bayesdist.utils.limits import DIFFERENCE
-from bayesdist.utils.numbers import p_words
+from bayesdist.utils.text import p_words
 
 MAX_BINS = 45  # along each axis, as in Appendix C
 COMBINED = "combined"

@@ -72,7 +72,7 @@ def record_to_arrays(record: Any) -> dict[str, NDArray[Any]]:
 
     Examples
     --------
-    >>> from bayesdist.utils.limits import PARETO_K
+    >>> from bayesdist.utils.checks import PARETO_K
     >>> record_from_arrays(record_to_arrays(PARETO_K)) == PARETO_K
     True
     """

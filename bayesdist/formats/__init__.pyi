@@ -17,13 +17,13 @@ from .idctab.table import (
 )
 from .lookup.tables import (
     read_d2im as read_d2im,
-    write_d2im as write_d2im,
-)
-from .lookup.tables import (
     read_npol as read_npol,
+    write_d2im as write_d2im,
     write_npol as write_npol,
 )
 from .sip.build import sip_from_solution as sip_from_solution
 from .sip.header import SipHeader as SipHeader
-from .sip.files import read_sip as read_sip
-from .sip.files import write_sip as write_sip
+from .sip.files import (
+    read_sip as read_sip,
+    write_sip as write_sip,
+)

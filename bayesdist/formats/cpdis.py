@@ -35,9 +35,15 @@ from bayesdist.products.common.cards import (
     text_card,
     wrapped_cards,
 )
-from bayesdist.products.common.celestial import TangentForm, refuse_singular, tangent_form
+from bayesdist.products.common.celestial import (
+    TangentForm,
+    cd_matrix,
+    image_size,
+    refuse_singular,
+    tangent_form,
+)
 from bayesdist.products.common.coefficients import require_regular
-from bayesdist.products.common.content import Content, Hdu, fits_bytes
+from bayesdist.products.common.content import Content, Hdu, TablePlane, fits_bytes
 from bayesdist.products.common.document import (
     BuildOptions,
     Built,
@@ -48,8 +54,6 @@ from bayesdist.products.common.document import (
     MissingSizeError,
     required_size,
 )
-from bayesdist.products.common.linear_wcs import cd_matrix, image_size
-from bayesdist.products.common.lookup_plane import TablePlane
 from bayesdist.products.common.parameters import (
     largest_difference,
     parameters_hdu,

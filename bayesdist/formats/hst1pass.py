@@ -17,7 +17,7 @@ import numpy as np
 
 from bayesdist.data.catalog import ReferenceCatalog
 from bayesdist.data.detections import Detections
-from bayesdist.data.formats.files import MatchFormat
+from bayesdist.data.formats import MatchFormat
 from bayesdist.data.matches import Matches
 from bayesdist.errors import FormatError
 from bayesdist.files.tables import is_binary

@@ -35,7 +35,13 @@ from bayesdist.products.common.cards import (
     text_card,
     wrapped_cards,
 )
-from bayesdist.products.common.celestial import TangentForm, refuse_singular, tangent_form
+from bayesdist.products.common.celestial import (
+    TangentForm,
+    cd_matrix,
+    image_size,
+    refuse_singular,
+    tangent_form,
+)
 from bayesdist.products.common.coefficients import require_regular, substitution
 from bayesdist.products.common.content import Content, readable
 from bayesdist.products.common.document import (
@@ -49,7 +55,6 @@ from bayesdist.products.common.document import (
     finding_lines,
     required_size,
 )
-from bayesdist.products.common.linear_wcs import cd_matrix, image_size
 from bayesdist.products.common.parameters import parameters_content, with_parameters
 from bayesdist.products.common.rules import (
     NO_SIZE,

@@ -20,8 +20,8 @@ from scipy.fft import irfft, next_fast_len, rfft
 from scipy.special import logsumexp, ndtri
 
 from bayesdist.utils.arrays import Float
-from bayesdist.utils.limits import DRAWS_PER_WALKER
-from bayesdist.utils.numbers import count
+from bayesdist.utils.checks import DRAWS_PER_WALKER
+from bayesdist.utils.text import count
 
 TAIL = (0.05, 0.95)  # the tail ESS is the effective sample size of these quantiles
 MIN_WEIGHTS = 25  # fewest importance weights; the Pareto tail is fitted to a fifth of them

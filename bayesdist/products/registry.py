@@ -26,8 +26,10 @@ from bayesdist.products.common.document import (
     Finding,
     Format,
     FormatSettings,
+    ReadBack,
+    by_calibrations,
+    of_chips,
 )
-from bayesdist.products.common.read_back import ReadBack, by_calibrations, of_chips
 
 if TYPE_CHECKING:
     from astropy.table import Table

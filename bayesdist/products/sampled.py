@@ -17,10 +17,9 @@ from bayesdist.calibration.plane import Plane
 from bayesdist.data.sky import is_on_plane, separation, sky_of_plane, tangent_plane
 from bayesdist.errors import InputError
 from bayesdist.products.common.cards import holds_wcs
-from bayesdist.products.common.celestial import projection_code, wcs_of
+from bayesdist.products.common.celestial import image_size, projection_code, wcs_of
 from bayesdist.products.common.content import Content, read_content
 from bayesdist.products.common.document import required_size
-from bayesdist.products.common.linear_wcs import image_size
 from bayesdist.utils.arrays import Float
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from bayesdist.assess.maps import per_axis
 from bayesdist.assess.requirements.verdict import VERDICT_LEVELS
-from bayesdist.utils.numbers import (
+from bayesdist.utils.text import (
     MISSING,
     counted,
     interval,

@@ -12,7 +12,7 @@ from bayesdist.files.atomic import atomic_path
 from bayesdist.report.page import template
 from bayesdist.report.texttable import Level
 from bayesdist.utils.checks import LEVELS
-from bayesdist.utils.numbers import MISSING, count, number
+from bayesdist.utils.text import MISSING, count, number
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Protocol, cast
 from bayesdist.assess.solution import chip_places
 from bayesdist.calibration.plane import ARCSEC
 from bayesdist.report.figures.mosaic import Mosaic
-from bayesdist.utils.numbers import MISSING, count, number, with_mas
+from bayesdist.utils.text import MISSING, count, number, with_mas
 
 if TYPE_CHECKING:
     from bayesdist.assess import UncertaintyMap

@@ -9,7 +9,7 @@ from pathlib import PurePath
 from typing import Any
 
 from bayesdist.utils.checks import Check
-from bayesdist.utils.numbers import MISSING, number
+from bayesdist.utils.text import MISSING, number
 
 _FEW_ROWS, _FEW_LETTERS = 16, 100  # largest table that leaves room for another one next to it
 MAX_ROWS = 60  # of frames and exposures; longer tables are only in files

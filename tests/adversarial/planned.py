@@ -14,7 +14,7 @@ from bayesdist.app.assessment.evaluating import margins_of_run
 from bayesdist.app.commands.on_runs.plan import content_of, futures_of, schedules_of
 from bayesdist.app.run import Run
 from bayesdist.assess import Requirement
-from bayesdist.assess.planning.futures import exposures_needed
+from bayesdist.assess.planning import exposures_needed
 
 from . import exposure_kinds, fields, selfcal_kinds
 from .exposure_kinds import Scatter

@@ -9,7 +9,7 @@ import pytest
 import bayesdist as bd
 from bayesdist import load_posterior
 from bayesdist.app.config import parse_config
-from bayesdist.data.formats.files import write_matches
+from bayesdist.data.formats import write_matches
 from bayesdist.errors import ConfigError
 from tests.app.support import (
     CENTRE,

@@ -10,7 +10,7 @@ from bayesdist.diagnose.residuals.binned import binned_sums, coverage_of
 from bayesdist.diagnose.residuals.misfit import partitions_for
 from bayesdist.infer.stars.shards import _hull
 from bayesdist.model import Chip
-from bayesdist.utils.limits import UNCOVERED_BY_CHANCE
+from bayesdist.utils.checks import UNCOVERED_BY_CHANCE
 
 SIZE = (1016.0, 508.0)
 CHIP = Chip(3, "A", SIZE, (508.5, 254.5))

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from bayesdist.assess.terms.functions import Alignment
 
 from bayesdist.assess import LocalErrors, Requirement, UserTerm, check_requirements
-from bayesdist.assess.alignment import Alignment
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.model import error_model
 from bayesdist.assess.terms.forms import Functions, Image, Row

@@ -6,7 +6,7 @@ from scipy import stats
 
 from bayesdist.assess import Requirement, UserTerm, check_requirements
 from bayesdist.assess.model import error_model
-from bayesdist.assess.planning.futures import (
+from bayesdist.assess.planning import (
     MOST,
     TRUTHS,
     ExistingData,

@@ -12,7 +12,7 @@ from astropy.table import Table
 from astropy.wcs.utils import fit_wcs_from_points
 
 from bayesdist.data import Matches, input_files, open_matches, read_matches
-from bayesdist.data.formats.files import write_matches
+from bayesdist.data.formats import write_matches
 from bayesdist.errors import FormatError, InputError
 
 

@@ -29,7 +29,7 @@ from bayesdist.infer.density.grid import build_proposal
 from bayesdist.infer.density.target import Target
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.simulate import simulate_matches
-from bayesdist.utils.limits import HELD_OUT_DOUBTFUL
+from bayesdist.utils.checks import HELD_OUT_DOUBTFUL
 from tests.reduced import case_in_full, only_in_full
 
 SIZE = (1000.0, 800.0)

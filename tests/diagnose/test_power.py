@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from bayesdist.diagnose import score_tests
-from bayesdist.utils.limits import SCORE_TESTS
+from bayesdist.utils.checks import SCORE_TESTS
 from tests.reduced import only_in_full
 
 from .. import seeds

@@ -10,7 +10,7 @@ from scipy import stats
 
 from bayesdist.diagnose.score.motions import visit_codes
 from bayesdist.model import TimeDependence
-from bayesdist.utils.limits import SCORE_TESTS
+from bayesdist.utils.checks import SCORE_TESTS
 from tests.reduced import case_in_full
 
 from .. import seeds

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bayesdist.utils.numbers import (
+from bayesdist.utils.text import (
     MISSING,
     count,
     counted,

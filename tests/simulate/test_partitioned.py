@@ -11,7 +11,7 @@ from scipy import stats
 from bayesdist.data import Matches, open_matches, read_matches
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.simulate import simulate_wise, simulate_wise_partitioned, wise_solution
-from bayesdist.simulate.matches import simulate_partitioned
+from bayesdist.simulate import simulate_partitioned
 
 NAMES = ("x", "y", "u", "v", "sigma_u", "sigma_v", "mag")
 

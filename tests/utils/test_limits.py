@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from bayesdist.utils import limits
-from bayesdist.utils.limits import Limit
+from bayesdist.utils import checks
+from bayesdist.utils.checks import Limit
 
-ROOT = Path(limits.__file__).parents[1]
+ROOT = Path(checks.__file__).parents[1]
 DOCS = ROOT.parent / "docs" / "method.md"
-ALL = {name: one for name, one in vars(limits).items() if isinstance(one, Limit)}
+ALL = {name: one for name, one in vars(checks).items() if isinstance(one, Limit)}
 
 
 def test_a_limit_is_met_on_its_good_side_and_by_no_missing_number():

@@ -16,7 +16,7 @@ from bayesdist.errors import InputError
 from bayesdist.infer import Shards, build_model, load
 from bayesdist.infer.stars.shards import Compute
 from bayesdist.model import Chip, DistortionModel
-from bayesdist.utils.limits import HELD_OUT
+from bayesdist.utils.checks import HELD_OUT
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,7 +28,7 @@ from bayesdist.files.atomic import atomic_path
 @force
 def camera(output: str, stars: int, seed: int, force: bool) -> None:
     """Simulate one SExtractor catalogue matched to Gaia, for the quickstart."""
-    from bayesdist.simulate.matches import matched_to_gaia
+    from bayesdist.simulate import matched_to_gaia
 
     if Path(output).exists() and not force:
         raise InputError(

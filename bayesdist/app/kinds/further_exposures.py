@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from bayesdist.app.run import Run
-from bayesdist.assess.planning.futures import Schedule
+from bayesdist.assess.planning import Schedule
 from bayesdist.assess.requirements.requirement import Requirement
 from bayesdist.infer.compare.planning import ExposureContent, exposure_information
 from bayesdist.utils.arrays import Float

@@ -28,7 +28,7 @@ from bayesdist.files.atomic import atomic_path, path_within
 from bayesdist.model import LookupTable
 from bayesdist.products.common.celestial import sky_of_header
 from bayesdist.products.registry import format_of, lint
-from bayesdist.utils.limits import FILE_ERROR, SKY_CLOSURE
+from bayesdist.utils.checks import FILE_ERROR, SKY_CLOSURE
 
 log = logging.getLogger("bayesdist")
 

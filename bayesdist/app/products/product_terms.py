@@ -27,7 +27,7 @@ from bayesdist.calibration.plane import ARCSEC
 from bayesdist.errors import BayesdistError
 from bayesdist.model import corrected
 from bayesdist.model.grid import grid_pixels, mesh
-from bayesdist.products.common.read_back import Positions, ReadBack, by_calibrations
+from bayesdist.products.common.document import Positions, ReadBack, by_calibrations
 from bayesdist.products.registry import read_back
 from bayesdist.utils.arrays import Float
 

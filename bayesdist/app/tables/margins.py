@@ -13,7 +13,7 @@ from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.store.summary import MarginRow, WorstPositionRow
 from bayesdist.assess import Margin, Requirement
 from bayesdist.assess.maps import per_axis
-from bayesdist.utils.numbers import probability_words
+from bayesdist.utils.text import probability_words
 
 # attributes that define the scope of a requirement, in addition to chip and epoch
 SCOPE = ("region", "epochs", "relative", "separation", "magnitude")

@@ -11,9 +11,9 @@ from bayesdist.calibration.chip_map import ChipMap
 from bayesdist.diagnose.residuals.misfit import Misfit
 from bayesdist.infer.compare.change_date import ChangeDate
 from bayesdist.infer.compare.monitoring import Change
+from bayesdist.utils.checks import DIFFERENCE
 from bayesdist.utils.distributions import f_sf
-from bayesdist.utils.limits import DIFFERENCE
-from bayesdist.utils.numbers import p_words
+from bayesdist.utils.text import p_words
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,9 +33,9 @@ from bayesdist.model import AXES
 from bayesdist.model.basis import point_blocks
 from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh, position_of_largest
 from bayesdist.utils.arrays import Float
+from bayesdist.utils.checks import DIFFERENCE
 from bayesdist.utils.distributions import norm_sf
-from bayesdist.utils.limits import DIFFERENCE
-from bayesdist.utils.numbers import p_words
+from bayesdist.utils.text import p_words
 
 __all__ = [
     "Comparison",

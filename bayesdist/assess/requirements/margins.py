@@ -36,7 +36,7 @@ from bayesdist.model import Chip, DistortionModel
 from bayesdist.model.grid import DEFAULT_GRID
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.checks import LARGER, Check, doubts_of
-from bayesdist.utils.numbers import counted, probability_words, rounded
+from bayesdist.utils.text import counted, probability_words, rounded
 
 EPOCHS = 9  # number of evenly spaced epochs, with both ends, at which a range is judged
 MOST_DRAWS = 512_000  # 99.9 % of verdicts are right 0.001 from the required probability 0.95

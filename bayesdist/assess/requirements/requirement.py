@@ -21,7 +21,7 @@ from bayesdist.data.tables.column import UNITS
 from bayesdist.diagnose.residuals.binned import Coverage
 from bayesdist.errors import InputError, require_known
 from bayesdist.model.grid import grid_pixels, mesh
-from bayesdist.utils.limits import BEYOND_STARS
+from bayesdist.utils.checks import BEYOND_STARS
 from bayesdist.utils.quantities import unit_name, value_in, year_of
 
 

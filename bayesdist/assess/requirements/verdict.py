@@ -22,10 +22,17 @@ from bayesdist.infer.posterior.checks import sampling_checks
 from bayesdist.model import DistortionModel
 from bayesdist.model.timedep import TimeDependence
 from bayesdist.utils.arrays import Bool, Float, Int
-from bayesdist.utils.checks import EITHER, LARGER, Check, doubts_of
+from bayesdist.utils.checks import (
+    CONFIDENCE,
+    COUNTING_ERROR,
+    EITHER,
+    EXCEEDS,
+    LARGER,
+    Check,
+    doubts_of,
+)
 from bayesdist.utils.distributions import beta_std
-from bayesdist.utils.limits import CONFIDENCE, COUNTING_ERROR, EXCEEDS
-from bayesdist.utils.numbers import count, probability_words
+from bayesdist.utils.text import count, probability_words
 
 # level of a check for each verdict, from best to worst
 VERDICT_LEVELS = {"met": "pass", "not shown": "warn", "undecided": "warn", "missed": "fail"}

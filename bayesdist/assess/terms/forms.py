@@ -27,9 +27,9 @@ from typing import ClassVar, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.assess.alignment import Alignment
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.solution import place_of
+from bayesdist.assess.terms.functions import Alignment
 from bayesdist.calibration.chip_map import position_moments
 from bayesdist.errors import required
 from bayesdist.model import DistortionModel

@@ -30,8 +30,7 @@ from bayesdist.diagnose.holdout.sums import (
 from bayesdist.diagnose.statistics import clopper_pearson, holm, hotelling_p
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Float
-from bayesdist.utils.distributions import chi2_sf, norm_sf
-from bayesdist.utils.limits import (
+from bayesdist.utils.checks import (
     HELD_OUT,
     HELD_OUT_DISTRIBUTION,
     HELD_OUT_DOUBTFUL,
@@ -39,7 +38,8 @@ from bayesdist.utils.limits import (
     HELD_OUT_TAILS,
     HELD_OUT_UNUSUAL,
 )
-from bayesdist.utils.numbers import p_words
+from bayesdist.utils.distributions import chi2_sf, norm_sf
+from bayesdist.utils.text import p_words
 
 SAMPLE = 200_000  # stars that determine the edges of bins
 # of importance: names of tests, the most informative first

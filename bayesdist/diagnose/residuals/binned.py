@@ -19,7 +19,7 @@ from bayesdist.errors import InputError, require_known
 from bayesdist.model import Chip
 from bayesdist.model.grid import mesh
 from bayesdist.utils.arrays import Bool, Float, Int
-from bayesdist.utils.limits import UNCOVERED, UNCOVERED_BY_CHANCE
+from bayesdist.utils.checks import UNCOVERED, UNCOVERED_BY_CHANCE
 
 BAND_AXES = ("X", "Y", "radial")
 _BLOCK = 2**16  # stars

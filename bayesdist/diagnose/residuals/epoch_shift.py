@@ -24,7 +24,7 @@ from bayesdist.diagnose.score.sample import ScoredSample, scored_sample
 from bayesdist.diagnose.statistics import squares_over
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.utils.arrays import Float, Int
-from bayesdist.utils.limits import EPOCH_SHIFT
+from bayesdist.utils.checks import EPOCH_SHIFT
 
 SAMPLE = 20_000  # largest number of detections that are used
 MIN_STARS = 30  # stars with motions

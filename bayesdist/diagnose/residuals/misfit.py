@@ -25,8 +25,7 @@ from bayesdist.infer.stars.stars import prepare
 from bayesdist.model import Chip
 from bayesdist.model.basis import polynomial_terms
 from bayesdist.utils.arrays import Float
-from bayesdist.utils.distributions import chi2_ppf, chi2_sf
-from bayesdist.utils.limits import (
+from bayesdist.utils.checks import (
     CHI2_TOO_LARGE,
     FALSE_MAJORITY,
     QUOTED_ERRORS,
@@ -34,7 +33,8 @@ from bayesdist.utils.limits import (
     STRUCTURE_SEEN,
     WIDENED_ERRORS,
 )
-from bayesdist.utils.numbers import p_words, size_of
+from bayesdist.utils.distributions import chi2_ppf, chi2_sf
+from bayesdist.utils.text import p_words, size_of
 
 STARS_PER_BIN = 25
 MAX_BINS = 32  # along each side

@@ -27,7 +27,7 @@ from bayesdist.infer.stars.stars import Stars, Sums, in_table_order, prepare
 from bayesdist.model import DistortionModel
 from bayesdist.model.grid import cell_index
 from bayesdist.utils.arrays import Bool, Float, Int
-from bayesdist.utils.limits import EXPOSURE_CHI2
+from bayesdist.utils.checks import EXPOSURE_CHI2
 
 SAMPLE = 200_000  # number of stars that represent all of them
 MIN_STARS = 50  # smallest number for an estimate of the scatter by magnitude

@@ -19,10 +19,9 @@ import numpy as np
 from scipy import special
 
 from bayesdist.diagnose.statistics import holm
-from bayesdist.utils.checks import LARGER
+from bayesdist.utils.checks import LARGER, SCORE_TESTS
 from bayesdist.utils.distributions import chi2_isf, chi2_sf, f_isf, f_sf
-from bayesdist.utils.limits import SCORE_TESTS
-from bayesdist.utils.numbers import p_words
+from bayesdist.utils.text import p_words
 
 HeldBy = Literal[
     "", "noise", "structure", "exposures", "curvature", "second order", "exposure fields", "time"

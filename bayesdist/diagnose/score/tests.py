@@ -18,7 +18,7 @@ from bayesdist.diagnose.score.shape import shape_tests
 from bayesdist.diagnose.score.truncation import radius_test, truncation_test
 from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.solution.solution import Solution
-from bayesdist.utils.limits import SCORE_TESTS
+from bayesdist.utils.checks import SCORE_TESTS
 
 
 def score_tests(

@@ -25,8 +25,7 @@ from bayesdist.diagnose.score.sample import ScoredSample
 from bayesdist.diagnose.statistics import chi_square_of
 from bayesdist.infer.kernel import GAUSSIAN
 from bayesdist.utils.arrays import Float, Int
-from bayesdist.utils.checks import EITHER
-from bayesdist.utils.limits import SCORE_TESTS
+from bayesdist.utils.checks import EITHER, SCORE_TESTS
 
 TRUNCATION = Family(
     "truncation",

@@ -38,8 +38,7 @@ from bayesdist.products.common.cards import (
     text_card,
     wrapped_cards,
 )
-from bayesdist.products.common.content import Hdu, hdus_of, read_hdus, write_hdus
-from bayesdist.products.common.lookup_plane import TablePlane
+from bayesdist.products.common.content import Hdu, TablePlane, hdus_of, read_hdus, write_hdus
 from bayesdist.utils.arrays import Float
 
 AXES = ("DX", "DY")

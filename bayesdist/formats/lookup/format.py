@@ -10,14 +10,13 @@ import numpy as np
 from bayesdist.errors import FormatError
 from bayesdist.formats.lookup.file import AXES, LookupFile, check_kind
 from bayesdist.model import LookupTable
-from bayesdist.products.common.content import Content
+from bayesdist.products.common.content import Content, TablePlane
 from bayesdist.products.common.document import (
     Finding,
     Format,
     finding_lines,
     identity_lines,
 )
-from bayesdist.products.common.lookup_plane import TablePlane
 from bayesdist.products.common.rules import (
     IDENTITY,
     Missing,

@@ -42,9 +42,10 @@ from bayesdist.products.common.document import (
     Finding,
     Format,
     FormatSettings,
+    ReadBack,
     finding_lines,
+    of_chips,
 )
-from bayesdist.products.common.read_back import ReadBack, of_chips
 from bayesdist.products.common.record import (
     at_date,
     calibration_from,

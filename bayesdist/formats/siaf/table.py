@@ -28,8 +28,7 @@ from bayesdist.files.documents import json_of
 from bayesdist.files.faults import reason_of
 from bayesdist.products.common.coefficients import Coefficients, evaluate
 from bayesdist.products.common.content import Content, read_content
-from bayesdist.products.common.document import Choice, MissingSizeError
-from bayesdist.products.common.read_back import ReadBack
+from bayesdist.products.common.document import Choice, MissingSizeError, ReadBack
 from bayesdist.products.common.record import calibration_from
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.text import number_of

@@ -21,16 +21,16 @@ from bayesdist.products.common.cards import (
     number_card,
     text_card,
 )
-from bayesdist.products.common.celestial import refuse_oversized
-from bayesdist.products.common.coefficients import sip_keyword, sip_powers
-from bayesdist.products.common.content import Content, read_content, readable
-from bayesdist.products.common.linear_wcs import (
+from bayesdist.products.common.celestial import (
     CD_KEYWORDS,
     LINEAR_KEYWORDS,
     cd_matrix,
     finite_number,
     image_size,
+    refuse_oversized,
 )
+from bayesdist.products.common.coefficients import sip_keyword, sip_powers
+from bayesdist.products.common.content import Content, read_content, readable
 
 # -- reading --------------------------------------------------------------------------------------
 

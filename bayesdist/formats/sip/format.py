@@ -43,6 +43,7 @@ from bayesdist.products.common.document import (
     Finding,
     Format,
     FormatSettings,
+    ReadBack,
     required_size,
 )
 from bayesdist.products.common.parameters import (
@@ -50,7 +51,6 @@ from bayesdist.products.common.parameters import (
     refuse_other,
     with_parameters,
 )
-from bayesdist.products.common.read_back import ReadBack
 from bayesdist.products.common.wcs_text import describe_wcs
 from bayesdist.utils.arrays import Float
 

@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from bayesdist.calibration.plausible import FAR
 from bayesdist.formats.sip.header import (
     EDGE,
     SIDE_FILE,
@@ -23,7 +22,7 @@ from bayesdist.formats.sip.header import (
     worst_closure,
 )
 from bayesdist.products.common.coefficients import largest_magnitude, sip_keyword
-from bayesdist.products.common.document import Finding
+from bayesdist.products.common.document import FAR, Finding
 from bayesdist.products.common.rules import Inverse, LinearPart, above_order, copies, stated_closure
 
 # Tolerance between a stated value and the computed one: headers print three decimals.

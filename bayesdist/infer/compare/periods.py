@@ -20,8 +20,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from bayesdist.errors import DegenerateError, InputError
-from bayesdist.infer.equations.normal import NormalEquations, least_squares
-from bayesdist.infer.equations.rank import require_full_rank
+from bayesdist.infer.equations.normal import NormalEquations, least_squares, require_full_rank
 from bayesdist.infer.equations.scaled import FieldTest, chi_square, scaled_cholesky, scaled_inverse
 from bayesdist.infer.solution.linear import LinearFit
 from bayesdist.infer.stars.stars import Stars, Sums

@@ -12,9 +12,9 @@ from .fit import (
     held_sigma as held_sigma,
 )
 from .grid import NodeGrid as NodeGrid
-from .hyperparameters import Matern as Matern
 from .posterior import (
     AxisField as AxisField,
+    Matern as Matern,
     TablePosterior as TablePosterior,
 )
 from .residuals import (

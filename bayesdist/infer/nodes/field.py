@@ -23,12 +23,13 @@ from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.kernel.blocks import at_once
 from bayesdist.infer.nodes.grid import BLOCK, STEP, NodeGrid, NodeSums, node_sums
-from bayesdist.infer.nodes.hyperparameters import (
+from bayesdist.infer.nodes.posterior import (
     SMOOTHNESS,
+    AxisField,
     Evidence,
+    TablePosterior,
     fitted_field,
 )
-from bayesdist.infer.nodes.posterior import AxisField, TablePosterior
 from bayesdist.infer.nodes.residuals import jitter_variance
 from bayesdist.model import Chip
 from bayesdist.model.lookup import LookupTable

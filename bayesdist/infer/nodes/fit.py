@@ -22,8 +22,7 @@ from bayesdist.errors import InputError
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.nodes.field import binned_table, field_table
 from bayesdist.infer.nodes.grid import STEP
-from bayesdist.infer.nodes.hyperparameters import SMOOTHNESS
-from bayesdist.infer.nodes.posterior import TablePosterior
+from bayesdist.infer.nodes.posterior import SMOOTHNESS, TablePosterior
 from bayesdist.infer.nodes.residuals import (
     ResidualMixture,
     corrected_matches,

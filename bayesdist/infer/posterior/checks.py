@@ -11,20 +11,23 @@ from bayesdist.infer.convergence import Convergence
 from bayesdist.infer.posterior import Posterior
 from bayesdist.infer.solution.linear import LinearFit
 from bayesdist.infer.solution.solution import Solution
-from bayesdist.utils.checks import EITHER, LARGER, Check, level_of
-from bayesdist.utils.distributions import chi2_cdf
-from bayesdist.utils.limits import (
+from bayesdist.utils.checks import (
     CHI2_TOO_LARGE,
     CHI2_TOO_SMALL,
     CHI2_TOO_SMALL_CHANCE,
     CONDITION,
+    EITHER,
     IMPORTANCE_EFFICIENCY,
+    LARGER,
     LEFT_OUT,
     MEAN_ERROR,
     PARETO_K,
     PIXEL_SIZE,
+    Check,
+    level_of,
 )
-from bayesdist.utils.numbers import count, number, percent
+from bayesdist.utils.distributions import chi2_cdf
+from bayesdist.utils.text import count, number, percent
 
 FIT, SAMPLING = "Fit", "Sampling"
 

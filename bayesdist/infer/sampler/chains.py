@@ -50,7 +50,7 @@ from bayesdist.infer.sampler.schedule import (
     walkers_for,
 )
 from bayesdist.utils.arrays import Float
-from bayesdist.utils.limits import PARETO_K
+from bayesdist.utils.checks import PARETO_K
 
 if TYPE_CHECKING:
     from bayesdist.infer.sampler.ensembles import Ensembles

@@ -35,7 +35,7 @@ from bayesdist.infer.stars.likelihood import OutlierMixture
 from bayesdist.infer.stars.loading import opened
 from bayesdist.infer.stars.shards import Compute, Shards
 from bayesdist.infer.stars.stars import Stars
-from bayesdist.utils.limits import PARETO_K
+from bayesdist.utils.checks import PARETO_K
 from bayesdist.utils.memory import require_memory
 from bayesdist.utils.quantities import takes, whole_number
 

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from bayesdist.infer.convergence import Convergence, Limits
+from bayesdist.utils.checks import DRAWS_PER_WALKER, PARETO_K
 from bayesdist.utils.distributions import chi2_isf
-from bayesdist.utils.limits import DRAWS_PER_WALKER, PARETO_K
 
 FIRST_CHECK = 50  # steps before the first convergence check of state-dependent moves
 PILOT = 512  # minimum number of pilot proposals

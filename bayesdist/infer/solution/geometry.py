@@ -22,7 +22,7 @@ from bayesdist.infer.solution.solution import Solution
 from bayesdist.model import DistortionModel
 from bayesdist.model.grid import mesh
 from bayesdist.utils.arrays import Float
-from bayesdist.utils.numbers import number
+from bayesdist.utils.text import number
 
 MAS = {"deg": 3.6e6, "arcsec": 1000.0, "mas": 1.0}  # milliarcseconds per unit of u, v
 GRID = 21  # positions per axis at which the distortion is evaluated

@@ -17,13 +17,14 @@ from bayesdist.data.matches import Matches
 from bayesdist.data.tables.column import conversion
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.equations.normal import (
+    check_coverage,
     gauss_newton,
     least_squares,
     refuse_absorbed_drift,
+    require_full_rank,
     starting_point,
 )
 from bayesdist.infer.equations.priors import GaussianPriors
-from bayesdist.infer.equations.rank import check_coverage, require_full_rank
 from bayesdist.infer.equations.scaled import scaled_cholesky
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.infer.stars.likelihood import Clip, ClippedGaussian

@@ -63,7 +63,7 @@ from bayesdist.model import Chip, DistortionModel, LookupTable, corrected
 from bayesdist.model.frames import RIGID
 from bayesdist.model.grid import grid_pixels, mesh
 from bayesdist.utils.arrays import Float
-from bayesdist.utils.limits import TREND
+from bayesdist.utils.checks import TREND
 
 SERIES = ("A_2", "A_3", "B_1", "B_2", "B_3")
 

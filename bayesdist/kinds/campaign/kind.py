@@ -48,9 +48,8 @@ from bayesdist.kinds.campaign.matching import (
     overlap_of,
 )
 from bayesdist.report.words import Terminology
-from bayesdist.utils.checks import LARGER, Check, level_of
-from bayesdist.utils.limits import COMPLETENESS, FALSE_MATCHES
-from bayesdist.utils.numbers import count, percent
+from bayesdist.utils.checks import COMPLETENESS, FALSE_MATCHES, LARGER, Check, level_of
+from bayesdist.utils.text import count, percent
 
 if TYPE_CHECKING:
     from bayesdist.infer.compare.monitoring import NewFit

@@ -31,7 +31,7 @@ from bayesdist.kinds.campaign.linear_terms import ExposuresAlone
 from bayesdist.kinds.campaign.series import FilterDependence, Series, TrendModel, filter_dependence
 from bayesdist.model import LookupTable, TimeDependence
 from bayesdist.utils.arrays import Float
-from bayesdist.utils.limits import DIFFERENCE
+from bayesdist.utils.checks import DIFFERENCE
 
 PRINTED = ("filter", "chip", "term", "at_edge", "sigma_at_edge")
 

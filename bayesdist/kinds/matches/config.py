@@ -36,7 +36,7 @@ from bayesdist.app.config.section import (
     names_nominal,
 )
 from bayesdist.data import FORMATS
-from bayesdist.data.formats.files import mission_formats
+from bayesdist.data.formats import mission_formats
 from bayesdist.data.tables.column import length_advice
 from bayesdist.errors import InputError
 from bayesdist.infer.compare.period_dates import check_periods, mjd_periods

@@ -16,7 +16,7 @@ from bayesdist.app.config import parse_config
 from bayesdist.app.kinds.plausibility import scatter_about_polynomials
 from bayesdist.app.store.output import refuse_existing
 from bayesdist.data import FORMATS, Matches, read_star_lists
-from bayesdist.data.formats.files import (
+from bayesdist.data.formats import (
     TableLayout,
     input_files,
     kind_of,

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from bayesdist.data.formats.files import TableLayout
+from bayesdist.data.formats import TableLayout
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Float, Int
 

@@ -23,8 +23,8 @@ from bayesdist.kinds.selfcal.infer.mode import SelfCalibrationMode
 from bayesdist.kinds.selfcal.infer.prior import frame_prior, pointing_prior, tie
 from bayesdist.model import DistortionModel
 from bayesdist.utils.arrays import Float, Int
+from bayesdist.utils.checks import GAUGE_CONTRADICTION
 from bayesdist.utils.distributions import chi2_sf
-from bayesdist.utils.limits import GAUGE_CONTRADICTION
 
 COLUMNS = ["name", "state", "sigma_detections", "sigma_fixed", "unit", "edge_pix", "fixed_by"]
 

@@ -12,7 +12,7 @@ from bayesdist.app.kinds.further_exposures import FurtherExposures
 from bayesdist.app.kinds.kind import EvaluationDomain, Outline, Questions, RunKind
 from bayesdist.app.run import Run
 from bayesdist.app.store.output import provenance_notes
-from bayesdist.assess.planning.futures import Schedule
+from bayesdist.assess.planning import Schedule
 from bayesdist.assess.requirements.requirement import Requirement
 from bayesdist.infer import Posterior
 from bayesdist.infer.compare.planning import ExposureContent

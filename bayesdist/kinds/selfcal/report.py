@@ -19,7 +19,7 @@ from bayesdist.report.figures.style import CYCLE, INK, PALE, WIDTH, new_figure
 from bayesdist.report.run import ReportedRun, scale_mas
 from bayesdist.report.texttable import MAX_ROWS, TextTable, further, listing, tabulated
 from bayesdist.utils.arrays import Float
-from bayesdist.utils.numbers import MISSING, count, display_scale, number, percent, with_mas
+from bayesdist.utils.text import MISSING, count, display_scale, number, percent, with_mas
 
 if TYPE_CHECKING:  # processes that draw need nothing else of a run
     from bayesdist.app.run import Run

@@ -34,7 +34,7 @@ from bayesdist.report.figures.fields import Grid, contour_levels, scalar_map
 from bayesdist.report.figures.panels import OneArray
 from bayesdist.report.figures.style import PALETTE, nice_below
 from bayesdist.utils.arrays import Float
-from bayesdist.utils.numbers import size_of
+from bayesdist.utils.text import size_of
 
 if TYPE_CHECKING:
     from bayesdist.diagnose.residuals.binned import BinnedResiduals

@@ -2,7 +2,9 @@
 
 A `Format` is a record of functions: parse, describe, lint, read, build. Parsing, checks and
 descriptions work on a `Document`, because a file with errors has no valid calibration and because
-lossless reading concerns the bytes. A `Calibration` is made from a document.
+lossless reading concerns the bytes. A `Calibration` is made from a document, and refused if no
+detector can have it. `ReadBack` has positions computed from written files, for comparison with the
+solution they were made from.
 """
 
 from __future__ import annotations
@@ -11,16 +13,17 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from astropy.io import fits
 from pydantic import BaseModel, ConfigDict
 
 from bayesdist.calibration.calibration import Calibration
-from bayesdist.calibration.plausible import refuse_senseless
-from bayesdist.errors import InputError
-from bayesdist.model import LookupTable
+from bayesdist.calibration.chip_map import ChipMap
+from bayesdist.errors import FormatError, InputError
+from bayesdist.model import LookupTable, TimeDependence
 from bayesdist.model.basis import MAX_ORDER
 from bayesdist.products.common.content import Content, readable
-from bayesdist.products.common.read_back import ReadBack
+from bayesdist.utils.arrays import Float
 
 if TYPE_CHECKING:
     from astropy.wcs import WCS
@@ -343,3 +346,150 @@ class Document:
             calibration = self.format.calibration(self.holds, self.name, choice)
             refuse_senseless(calibration)
             return calibration
+
+
+Positions = Callable[[Float, Float, int, float | None], Float]
+
+
+@dataclass(frozen=True, eq=False)
+class ReadBack:
+    """Positions that a file yields when its bytes are read back."""
+
+    file: str  # name of the file, or of several files that form one product
+    forward: Positions  # (x (N,), y (N,), chip number, date) -> positions (N, 2)
+    # same arguments -> error (N, 2) of the pixel after forward and inverse; None without an inverse
+    missed: Positions | None = None
+    # True if the file has separate axes and unit, so that shift, rotation and scale do not
+    # count as errors; otherwise positions are along u, v in their unit
+    own_axes: bool = False
+
+
+def by_calibrations(
+    file: str, sets: Sequence[Calibration], time: TimeDependence | None
+) -> ReadBack:
+    """Positions computed from the calibrations of a file that defines its own axes.
+
+    `sets` holds one calibration, or one per segment of the drift. `time` is the time dependence of
+    the solution that the file was made from.
+    """
+
+    def of(epoch: float | None) -> Calibration:
+        if time is None or epoch is None or len(sets) == 1:
+            return sets[0]
+        return sets[int(np.searchsorted(time.breaks, epoch, side="right"))]
+
+    def within(one: Calibration, chip: int) -> int:
+        # a file of one chip may count from 1
+        return chip if chip in one.numbers or len(one.numbers) > 1 else one.numbers[0]
+
+    def forward(x: Float, y: Float, chip: int, epoch: float | None) -> Float:
+        calibration = of(epoch)
+        # a calibration without drift does not accept a date
+        return calibration.forward(
+            x, y, chip=within(calibration, chip), epoch=epoch if calibration.model.time else None
+        )
+
+    def missed(x: Float, y: Float, chip: int, epoch: float | None) -> Float:
+        calibration = of(epoch)
+        number = within(calibration, chip)
+        about_zero = calibration.at(origin="chip")[number]  # at the date of the inverse rows
+        back = calibration.inverses[number].pixels(*about_zero.at(x, y))
+        return np.stack([back[0] - x, back[1] - y], axis=-1)
+
+    inverses = all(one.inverses for one in sets)
+    return ReadBack(file, forward, missed if inverses else None, own_axes=True)
+
+
+def of_chips(parts: Mapping[int, ReadBack]) -> ReadBack:
+    """Combine files of one format that hold different chips; `parts` maps chip numbers to files."""
+
+    def forward(x: Float, y: Float, chip: int, epoch: float | None) -> Float:
+        return parts[chip].forward(x, y, chip, epoch)
+
+    def missed(x: Float, y: Float, chip: int, epoch: float | None) -> Float:
+        return back[chip](x, y, chip, epoch)
+
+    each = parts.values()
+    back = {n: part.missed for n, part in parts.items() if part.missed is not None}
+    names = dict.fromkeys(part.file for part in each)
+    return ReadBack(
+        ", ".join(names),
+        forward,
+        missed if len(back) == len(parts) else None,
+        own_axes=any(part.own_axes for part in each),
+    )
+
+
+MOST_PIXELS = 1e6  # columns or rows of a chip
+FAR = 1e7  # largest coordinate of a reference pixel, pixels
+BEND = 10.0  # largest nonlinear displacement, in units of the chip's size
+ROUNDING = 1e-3  # relative tolerance for rounded covariances in text files
+OFF = 1e3  # largest ratio between a stated scale and the pixel scale of the linear terms
+
+
+def refuse_senseless(found: Calibration) -> None:
+    """Raise FormatError if sizes, scales, errors or coefficients are implausible for a detector."""
+    do = "correct the file, or fetch it again"
+    for cause in _faults(found):
+        raise FormatError(cause, where=found.name, do=do)
+
+
+def _faults(found: Calibration) -> list[str]:
+    for chip in found.model.chips:
+        if not all(1 < n <= MOST_PIXELS for n in chip.size):
+            return [f"chip {chip.number} has {chip.size[0]:g} x {chip.size[1]:g} pixels"]
+        if not np.abs(chip.reference_pixel).max() <= FAR:
+            x, y = chip.reference_pixel
+            return [f"chip {chip.number} has its reference pixel at ({x:g}, {y:g})"]
+    if not np.isfinite(found.solution.mean).all():
+        return ["some coefficients are not finite"]
+    if not np.isfinite(found.solution.cov).all():
+        return ["some errors of coefficients are not finite"]
+    if not _is_covariance(found.solution.cov):
+        return ["the covariance of its coefficients is invalid: a correlation exceeds 1"]
+    if any(not np.isfinite(table.values).all() for table in (*found.before, *found.after)):
+        return ["some values of its look-up tables are not finite"]
+    point = found.plane.point
+    if point is not None and not (abs(point[0]) <= 360 and abs(point[1]) <= 90):
+        return [f"the plane touches the sky at ({point[0]:g}, {point[1]:g}) degrees: on no sphere"]
+    try:
+        maps = found.at(origin="stated")
+    except InputError:  # it cannot be evaluated without a date
+        return []
+    faults = [
+        fault for number, chip_map in maps.items() for fault in _faults_of_map(number, chip_map)
+    ]
+    if faults or found.scale is None:
+        return faults
+    pixel = float(np.sqrt(abs(np.linalg.det(next(iter(maps.values())).linear))))
+    if not 1 / OFF < found.scale / pixel < OFF:
+        return [f"the stated scale is {found.scale:g}, but the linear terms give {pixel:.3g}"]
+    return []
+
+
+def _is_covariance(cov: Float) -> bool:
+    """True if no variance is negative and all correlations are between -1 and 1."""
+    variance = np.diag(cov)
+    if variance.min(initial=0.0) < 0:
+        return False
+    sigma = np.sqrt(variance)
+    return bool((np.abs(cov) <= (1 + ROUNDING) * np.outer(sigma, sigma)).all())
+
+
+def _faults_of_map(number: int, one: ChipMap) -> list[str]:
+    """Faults of the polynomial of a chip, as clauses."""
+    area = abs(float(np.linalg.det(one.linear)))
+    (nx, ny), (x0, y0) = one.basis.size, one.basis.reference_pixel
+    x, y = (a.ravel() for a in np.meshgrid(np.linspace(1, nx, 5), np.linspace(1, ny, 5)))
+    if not area > 0 or not np.isfinite(area):
+        return [f"the linear terms of chip {number} give a pixel without area"]
+    zero = one.basis.evaluate(np.array([x0]), np.array([y0])) @ one.coefficients.T
+    offsets = one.basis.evaluate(x, y) @ one.coefficients.T - zero
+    bend = np.hypot(*(offsets - np.stack([x - x0, y - y0], axis=1) @ one.linear.T).T)
+    reach = max(nx, ny, float(np.hypot(x - x0, y - y0).max())) * np.sqrt(area)
+    if not bend.max() < BEND * reach:
+        return [
+            f"the polynomial of chip {number} deviates by {bend.max() / np.sqrt(area):.3g} px from "
+            f"its linear terms, on a chip of {nx:g} x {ny:g} pixels"
+        ]
+    return []

@@ -26,7 +26,7 @@ from bayesdist.report.figures.style import (
 )
 from bayesdist.utils.arrays import Bool, Float
 from bayesdist.utils.distributions import f_isf
-from bayesdist.utils.numbers import size_of
+from bayesdist.utils.text import size_of
 
 if TYPE_CHECKING:
     from bayesdist.assess import UncertaintyMap, VectorMap

@@ -29,7 +29,7 @@ from bayesdist.report.figures.style import (
 )
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.distributions import chi2_ppf, chi2_sf, norm_isf
-from bayesdist.utils.numbers import display_scale, size_of
+from bayesdist.utils.text import display_scale, size_of
 
 if TYPE_CHECKING:
     from bayesdist.assess.comparison.compare import Comparison

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 
 from bayesdist.errors import InputError
-from bayesdist.utils.numbers import Scale, display_scale
+from bayesdist.utils.text import Scale, display_scale
 
 
 def axes_of(ax: Axes | None, *, height: float = 0.0) -> Axes:

@@ -28,7 +28,7 @@ from bayesdist.report.figures.style import (
 )
 from bayesdist.report.plots.axes import axes_of, scale_of, set_title
 from bayesdist.utils.arrays import Float
-from bayesdist.utils.numbers import Scale, counted, display_scale, number
+from bayesdist.utils.text import Scale, counted, display_scale, number
 
 if TYPE_CHECKING:
     from bayesdist.assess import ErrorBudget, Margin

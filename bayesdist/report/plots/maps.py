@@ -23,7 +23,7 @@ from bayesdist.report.figures.fields import Grid, draw_grid, error_levels
 from bayesdist.report.figures.panels import chip_axes
 from bayesdist.report.figures.style import COLORBAR, nice_below
 from bayesdist.report.plots.axes import add_colorbar, axes_of, scale_of, set_title
-from bayesdist.utils.numbers import number, size_of
+from bayesdist.utils.text import number, size_of
 
 if TYPE_CHECKING:
     from bayesdist.assess import UncertaintyMap, VectorMap

@@ -19,7 +19,7 @@ from bayesdist.errors import InputError
 from bayesdist.report.figures.style import COLORBAR, CYCLE, DIVERGING, PALETTE, Tones
 from bayesdist.report.plots.axes import axes_of
 from bayesdist.utils.arrays import Float, Int
-from bayesdist.utils.numbers import broken_name, display_scale
+from bayesdist.utils.text import broken_name, display_scale
 
 if TYPE_CHECKING:
     from bayesdist.infer import Posterior

@@ -25,7 +25,7 @@ from bayesdist.report.figures.panels import chip_axes
 from bayesdist.report.figures.style import PALETTE, SEQUENTIAL, Tones, nice_below
 from bayesdist.report.plots.axes import add_colorbar, axes_of, scale_of, set_title
 from bayesdist.utils.arrays import Float
-from bayesdist.utils.numbers import Scale, count
+from bayesdist.utils.text import Scale, count
 
 if TYPE_CHECKING:
     from bayesdist.data import MagnitudeErrors

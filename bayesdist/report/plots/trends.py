@@ -15,7 +15,7 @@ from bayesdist.report.figures.style import CYCLE, Tones, guide_lines
 from bayesdist.report.plots.axes import axes_of, scale_of, set_title
 from bayesdist.report.plots.residuals import AXES
 from bayesdist.utils.arrays import Bool, Float, Int
-from bayesdist.utils.numbers import Scale
+from bayesdist.utils.text import Scale
 
 if TYPE_CHECKING:
     from bayesdist.diagnose.residuals.stars import ExposureScatter, StarSample

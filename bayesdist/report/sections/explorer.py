@@ -17,7 +17,7 @@ from bayesdist.report.contents import REPORT, needed
 from bayesdist.report.figures.style import CYCLE, SEQUENTIAL
 from bayesdist.report.run import ReportedRun, mosaic_of, scale_mas, shown_maps
 from bayesdist.utils.arrays import Float
-from bayesdist.utils.numbers import ladder
+from bayesdist.utils.text import ladder
 
 MOMENT_DIGITS = 7  # quadratic forms of moments, and differences of displacements, partly cancel
 CURVED_DIGITS = 9  # of moments at more than three epochs, which differ by orders of magnitude

@@ -16,7 +16,7 @@ from bayesdist.data.matches import Matches
 from bayesdist.errors import DegenerateError
 from bayesdist.infer import Rejection, fit_linear, load, residuals
 from bayesdist.infer.equations.arrow import Arrow
-from bayesdist.infer.equations.rank import check_coverage, null_space
+from bayesdist.infer.equations.normal import check_coverage, null_space
 from bayesdist.model import DistortionModel, TimeDependence
 
 from ..support import CHIP, TWO_CHIPS, exposures, simulated, table

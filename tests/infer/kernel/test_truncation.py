@@ -16,7 +16,7 @@ from bayesdist.errors import InputError
 from bayesdist.infer import Compute, GaussianPriors, OutlierMixture, fit_linear, load, sample
 from bayesdist.infer.density.laplace import Split, conditional_mode, starting_point
 from bayesdist.infer.density.target import Target
-from bayesdist.infer.kernel import circle
+from bayesdist.infer.kernel import truncated
 from bayesdist.infer.posterior.memberships import memberships, star_log_likelihood
 from bayesdist.infer.stars.likelihood import MixtureAt
 from tests.reduced import case_in_full
@@ -52,9 +52,9 @@ def nodes():
 def circle_terms(du, dv, A, B, radius):
     """Log of the probability that Gaussians fall in circles and its derivatives, shape (N, 10)."""
     four = np.stack(np.broadcast_arrays(*np.atleast_1d(du, dv, A, B)), axis=1)
-    out, q, work = np.empty((len(four), 10)), np.empty(circle.MOST), np.empty(circle.MOST)
+    out, q, work = np.empty((len(four), 10)), np.empty(truncated.MOST), np.empty(truncated.MOST)
     for at, row in zip(four, out, strict=True):
-        circle.slopes(*at, float(radius), circle.NODES, q, work, row)
+        truncated.slopes(*at, float(radius), truncated.NODES, q, work, row)
     return out
 
 

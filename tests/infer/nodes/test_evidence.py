@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
 
-from bayesdist.infer.nodes import hyperparameters
+from bayesdist.infer.nodes import posterior
 from bayesdist.infer.nodes.grid import node_sums
-from bayesdist.infer.nodes.hyperparameters import SMOOTHNESS, Evidence, Matern, fitted_field
+from bayesdist.infer.nodes.posterior import SMOOTHNESS, Evidence, Matern, fitted_field
 from tests.infer.nodes.support import (
     CHIP,
     PATTERN,
@@ -167,7 +167,7 @@ def test_search_at_a_bound_ends_at_the_best_point_along_it(rng, which, monkeypat
     best = np.log([top.prior.amplitude, top.prior.length])
     low, high = best - 3.0, best + 3.0
     high[which] = best[which] - 1.0
-    monkeypatch.setattr(hyperparameters, "_bounds", lambda _: (low, high))
+    monkeypatch.setattr(posterior, "_bounds", lambda _: (low, high))
     monkeypatch.setattr(Evidence, "start", (low + high) / 2)
     evidence = evidence_of(*data)
     found = fitted_field(evidence, (1.5,), thorough=True)
@@ -180,7 +180,7 @@ def test_search_at_a_bound_ends_at_the_best_point_along_it(rng, which, monkeypat
         return -evidence.at(Matern(*np.exp(point), 1.5)).log_evidence
 
     along = minimize_scalar(density, bounds=(low[1 - which], high[1 - which]), method="bounded")
-    assert found.log_evidence > -along.fun - hyperparameters.SETTLED
+    assert found.log_evidence > -along.fun - posterior.SETTLED
 
 
 def test_the_start_on_tiles_is_near_the_end(rng):

@@ -14,7 +14,7 @@ from bayesdist.app.screen import table_text
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.store.summary import head_of
 from bayesdist.report.overview import OverviewRow, write_overview
-from bayesdist.utils.numbers import with_mas
+from bayesdist.utils.text import with_mas
 
 log = logging.getLogger("bayesdist")
 

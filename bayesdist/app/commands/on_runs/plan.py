@@ -14,7 +14,7 @@ from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.tables.margins import judged_requirements
 from bayesdist.assess.evaluation import with_measured_centroids
 from bayesdist.assess.model import with_diagnosed_errors, with_shared_stars
-from bayesdist.assess.planning.futures import (
+from bayesdist.assess.planning import (
     ExistingData,
     Futures,
     Need,

@@ -25,7 +25,7 @@ from bayesdist.report.figures.style import CYCLE, INK, WIDTH, guide_lines, legen
 from bayesdist.report.run import ReportedRun
 from bayesdist.report.texttable import TextTable, listing
 from bayesdist.utils.arrays import Bool, Float
-from bayesdist.utils.numbers import (
+from bayesdist.utils.text import (
     MISSING,
     count,
     display_scale,

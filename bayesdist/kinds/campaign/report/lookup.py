@@ -25,7 +25,7 @@ from bayesdist.report.run import ReportedRun, mosaic_of
 from bayesdist.report.sections.run.residuals import residual_panels
 from bayesdist.report.texttable import TextTable, listing, tabulated
 from bayesdist.utils.arrays import Float
-from bayesdist.utils.numbers import count, display_scale, number, size_of
+from bayesdist.utils.text import count, display_scale, number, size_of
 
 if TYPE_CHECKING:
     from bayesdist.diagnose.residuals.binned import BinnedResiduals

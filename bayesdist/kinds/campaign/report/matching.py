@@ -21,7 +21,7 @@ from bayesdist.report.figures.style import (
 from bayesdist.report.run import ReportedRun
 from bayesdist.report.texttable import TextTable, listing
 from bayesdist.utils.arrays import Float
-from bayesdist.utils.numbers import count, number, percent, size_of
+from bayesdist.utils.text import count, number, percent, size_of
 
 _DOT = "#8FA3B5"
 _LEFT_OUT = PALETTE["vermilion"]

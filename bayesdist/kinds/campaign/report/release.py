@@ -14,7 +14,7 @@ from bayesdist.report.figures.panels import Panels
 from bayesdist.report.figures.style import WIDTH, new_figure, nice_below
 from bayesdist.report.run import ReportedRun
 from bayesdist.report.texttable import TextTable, tabulated
-from bayesdist.utils.numbers import count, number, size_of
+from bayesdist.utils.text import count, number, size_of
 
 MIN_STARS_PER_CELL = 5  # of a cell that is drawn and counted
 

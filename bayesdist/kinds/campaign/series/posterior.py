@@ -22,7 +22,7 @@ from bayesdist.infer.kernel import densities
 from bayesdist.kinds.campaign.series.sampler import Draws, Engine, SeriesProblem, State, run
 from bayesdist.kinds.campaign.series.series import Design, Series, TrendModel
 from bayesdist.utils.arrays import Float, Int
-from bayesdist.utils.limits import PARETO_K
+from bayesdist.utils.checks import PARETO_K
 
 CHAINS, WARMUP, SWEEPS = 32, 50, 50  # number of chains; sweeps of the warm-up; first sweeps
 

@@ -21,8 +21,8 @@ from bayesdist.diagnose.residuals.binned import BinnedResiduals
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.model.basis import n_terms, polynomial_terms
 from bayesdist.utils.arrays import Bool, Float, Int
+from bayesdist.utils.checks import STRUCTURE
 from bayesdist.utils.distributions import f_sf
-from bayesdist.utils.limits import STRUCTURE
 
 Base = tuple[Float, Float]
 

@@ -20,7 +20,7 @@ from bayesdist.report.figures.fields import Grid, scalar_map
 from bayesdist.report.figures.panels import ArrayPanels
 from bayesdist.report.figures.style import INK, PALETTE, WIDTH, legend_above, new_figure, nice_below
 from bayesdist.utils.arrays import Float
-from bayesdist.utils.numbers import number, probability, size_of
+from bayesdist.utils.text import number, probability, size_of
 
 if TYPE_CHECKING:
     from bayesdist.assess import UncertaintyMap, VectorMap

@@ -16,7 +16,7 @@ from bayesdist.missions.wise.bands.context import BANDS, BandResult, BandsInput,
 from bayesdist.missions.wise.bands.figures import CASES, below_draws, chance_of
 from bayesdist.report.sections.run.status import Verdict
 from bayesdist.report.texttable import TextTable, listing
-from bayesdist.utils.numbers import MISSING, count, number, percent, probability, rounded, size_of
+from bayesdist.utils.text import MISSING, count, number, percent, probability, rounded, size_of
 
 SAME_VECTOR = 0.005  # relative difference up to which the longest vector agrees with the published
 

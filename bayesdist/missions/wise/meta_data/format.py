@@ -50,9 +50,9 @@ from bayesdist.products.common.document import (
     Finding,
     Format,
     FormatSettings,
+    ReadBack,
     finding_lines,
 )
-from bayesdist.products.common.read_back import ReadBack
 
 Bands = tuple[WiseBand, ...]
 

@@ -17,7 +17,7 @@ import numpy as np
 from astropy.table import Column, Table
 
 from bayesdist.data.batches import BATCH
-from bayesdist.data.formats.files import input_files
+from bayesdist.data.formats import input_files
 from bayesdist.data.matches import Matches
 from bayesdist.data.reading.columns import match_columns
 from bayesdist.data.reading.options import ReadOptions, check_sigma, refuse_missing_errors

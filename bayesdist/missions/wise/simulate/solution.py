@@ -11,7 +11,7 @@ from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.published import SAMPLE_SIZES, WISE_ARRAYS, WISE_COEFFICIENTS
 from bayesdist.model import Chip, DistortionModel
-from bayesdist.simulate.matches import Truth, simulate_matches, simulate_partitioned
+from bayesdist.simulate import Truth, simulate_matches, simulate_partitioned
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.quantities import Random, generator_of
 

@@ -22,8 +22,8 @@ from bayesdist.products.common.document import (
     Choice,
     Finding,
     Format,
+    ReadBack,
 )
-from bayesdist.products.common.read_back import ReadBack
 from bayesdist.products.common.record import CalibrationRecord
 
 # these need astropy.modeling, which takes longer to import than other files take to read
@@ -104,7 +104,7 @@ class Observatory(Generic[Settings]):
         self, calibration: Calibration, settings: Settings, options: BuildOptions
     ) -> tuple[Built, ...]:
         """Build one file per chip."""
-        from bayesdist.products.common.asdf.build import chip_transforms, refuse_larger
+        from bayesdist.products.common.asdf.distortion import chip_transforms, refuse_larger
 
         out = []
         several, location = len(calibration.numbers) > 1, f"products.{self.key}"

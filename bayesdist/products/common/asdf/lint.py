@@ -12,9 +12,12 @@ from bayesdist.products.common.asdf.distortion import (
     DistortionFile,
     closure_of,
     departure,
+    exchanged,
+    leaves,
+    order_of,
     recorded,
+    tables_of,
 )
-from bayesdist.products.common.asdf.transforms import exchanged, leaves, order_of, tables_of
 from bayesdist.products.common.document import Finding, finding_lines
 from bayesdist.products.common.record import error_lines
 from bayesdist.products.common.rules import (

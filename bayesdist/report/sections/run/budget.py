@@ -33,7 +33,7 @@ from bayesdist.report.run import (
 )
 from bayesdist.report.texttable import TextTable
 from bayesdist.utils.arrays import Float
-from bayesdist.utils.numbers import (
+from bayesdist.utils.text import (
     MISSING,
     Scale,
     length_scale,

@@ -13,7 +13,7 @@ from bayesdist.report.contents import REPORT
 from bayesdist.report.run import ReportedRun, has_several_chips, marked
 from bayesdist.report.sections.gauge import gauge_mark, gauge_note
 from bayesdist.report.texttable import MAX_ROWS, TextTable, further, tabulated
-from bayesdist.utils.numbers import MISSING, interval, number, rounded
+from bayesdist.utils.text import MISSING, interval, number, rounded
 
 _ON_SCREEN = ("68 %", "95 %", "R-hat", "ESS")
 MAX_PRINTED = 240  # Legendre coefficients on paper: two pages

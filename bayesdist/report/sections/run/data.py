@@ -23,7 +23,7 @@ from bayesdist.report.texttable import (
     tabulated,
 )
 from bayesdist.utils.arrays import Bool, Float
-from bayesdist.utils.numbers import MISSING, count, display_scale, number
+from bayesdist.utils.text import MISSING, count, display_scale, number
 
 if TYPE_CHECKING:
     from bayesdist.data import MagnitudeErrors

@@ -18,8 +18,8 @@ from bayesdist.report.run import (
 )
 from bayesdist.report.texttable import TextTable, listing, tabulated
 from bayesdist.utils.arrays import Bool
-from bayesdist.utils.limits import SCORE_TESTS
-from bayesdist.utils.numbers import MISSING, count, display_scale, number, rounded, with_mas
+from bayesdist.utils.checks import SCORE_TESTS
+from bayesdist.utils.text import MISSING, count, display_scale, number, rounded, with_mas
 
 
 @REPORT.table("fit")

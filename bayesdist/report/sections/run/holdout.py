@@ -17,7 +17,7 @@ from bayesdist.report.figures.style import CYCLE, INK, WIDTH, new_figure
 from bayesdist.report.run import ReportedRun, mosaic_of
 from bayesdist.report.texttable import TextTable, tabulated
 from bayesdist.utils.distributions import binom_ppf
-from bayesdist.utils.numbers import count, number
+from bayesdist.utils.text import count, number
 
 if TYPE_CHECKING:
     from bayesdist.diagnose.holdout.validation import HeldTest

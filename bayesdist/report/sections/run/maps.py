@@ -38,7 +38,7 @@ from bayesdist.report.run import (
 )
 from bayesdist.report.sections.gauge import gauge_mark, gauge_of_maps
 from bayesdist.report.texttable import TextTable, tabulated
-from bayesdist.utils.numbers import display_scale, number, size_of, with_mas
+from bayesdist.utils.text import display_scale, number, size_of, with_mas
 
 if TYPE_CHECKING:
     from bayesdist.assess import VectorMap

@@ -9,7 +9,7 @@ from bayesdist.report.figures.style import WIDTH, new_figure
 from bayesdist.report.plots.errors import plot_margins, plot_validity
 from bayesdist.report.run import ReportedRun, has_several_chips, marked
 from bayesdist.report.texttable import TextTable, tabulated
-from bayesdist.utils.numbers import (
+from bayesdist.utils.text import (
     count,
     counted,
     interval,

@@ -12,7 +12,7 @@ from bayesdist.report.figures.panels import ChipPanels
 from bayesdist.report.figures.style import nice_below
 from bayesdist.report.run import ReportedRun, mosaic_of, on_chip, position_text, scale_mas
 from bayesdist.report.texttable import TextTable, listing, tabulated
-from bayesdist.utils.numbers import (
+from bayesdist.utils.text import (
     MISSING,
     count,
     display_scale,

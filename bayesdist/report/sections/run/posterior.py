@@ -19,7 +19,7 @@ from bayesdist.report.plots.posterior import (
 )
 from bayesdist.report.run import ReportedRun, marked
 from bayesdist.report.texttable import TextTable, tabulated
-from bayesdist.utils.numbers import (
+from bayesdist.utils.text import (
     MISSING,
     Scale,
     count,

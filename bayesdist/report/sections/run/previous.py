@@ -8,7 +8,7 @@ from bayesdist.report.contents import REPORT, Plot
 from bayesdist.report.figures.commands import difference_vectors
 from bayesdist.report.run import ReportedRun, scale_mas
 from bayesdist.report.texttable import TextTable, tabulated
-from bayesdist.utils.numbers import MISSING, number, percent, with_mas
+from bayesdist.utils.text import MISSING, number, percent, with_mas
 
 ERRORS = {
     "both": "The errors of both are taken as independent.",

@@ -17,7 +17,7 @@ from bayesdist.report.contents import REPORT
 from bayesdist.report.run import ReportedRun
 from bayesdist.report.texttable import Level, TextTable, check_cells, listing, moment, short_paths
 from bayesdist.utils.checks import Check
-from bayesdist.utils.numbers import MISSING, count, number, percent
+from bayesdist.utils.text import MISSING, count, number, percent
 
 _BLANK = "_" * 24  # to be filled in on paper
 _DETAILS = ("stages", "timings", "versions")  # not printed; each page names the version

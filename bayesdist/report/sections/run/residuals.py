@@ -27,7 +27,7 @@ from bayesdist.report.plots.residuals import (
 from bayesdist.report.run import ReportedRun, mosaic_of, sample_words, shown_residuals
 from bayesdist.report.sections.run.maps import map_panels
 from bayesdist.utils.arrays import Float
-from bayesdist.utils.numbers import display_scale
+from bayesdist.utils.text import display_scale
 
 if TYPE_CHECKING:
     from bayesdist.diagnose.residuals.binned import BinnedResiduals

@@ -27,7 +27,7 @@ from bayesdist.report.run import (
 from bayesdist.report.sections.run.provenance import checks_of_file, written_files
 from bayesdist.report.texttable import TextTable, check_cells
 from bayesdist.utils.checks import GROUPS, LEVELS, Check, doubts_of, warnings_of, worst
-from bayesdist.utils.numbers import count, counted, rounded, with_mas
+from bayesdist.utils.text import count, counted, rounded, with_mas
 
 if TYPE_CHECKING:
     from bayesdist.assess import Margin

@@ -18,7 +18,7 @@ from bayesdist.report.plots.trends import (
     properties_of,
 )
 from bayesdist.report.run import ReportedRun, has_several_chips, sample_words
-from bayesdist.utils.numbers import count, display_scale, number
+from bayesdist.utils.text import count, display_scale, number
 
 _FINE_BINS = 100  # largest number of bins along an axis
 

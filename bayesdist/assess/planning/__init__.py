@@ -1,1 +1,0 @@
-"""Planning of further exposures: their number, and the best dithers."""

@@ -1,1 +1,0 @@
-"""Input files: resolution of paths, recognition of formats, and formats of other programs."""
