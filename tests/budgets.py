@@ -6,7 +6,8 @@ import numpy as np
 
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.model import error_model
-from bayesdist.assess.terms.forms import Polynomials, Row
+from bayesdist.assess.terms.forms import Row
+from bayesdist.assess.terms.functions import Polynomials
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.model.grid import DEFAULT_GRID
 

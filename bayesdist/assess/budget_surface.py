@@ -17,7 +17,8 @@ import numpy as np
 
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.drawn import DrawnErrors
-from bayesdist.assess.terms.forms import LOCAL, ErrorField, Image, Known, PolynomialField, Row
+from bayesdist.assess.terms.forms import LOCAL, ErrorField, Image, Known, Row
+from bayesdist.assess.terms.functions import PolynomialField
 from bayesdist.assess.terms.given import Centroids
 from bayesdist.data.magnitude_errors import MagnitudeErrors
 from bayesdist.errors import InputError

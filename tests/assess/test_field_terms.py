@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bayesdist.assess.terms.functions import Alignment
 
 from bayesdist.assess import LocalErrors, Requirement, UserTerm, check_requirements
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.model import error_model
-from bayesdist.assess.terms.forms import Functions, Image, Row
+from bayesdist.assess.terms.forms import Image, Row
+from bayesdist.assess.terms.functions import Alignment, Functions
 from bayesdist.assess.terms.parameters import (
     MOTIONS,
     CatalogueErrors,

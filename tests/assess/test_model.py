@@ -23,7 +23,8 @@ from bayesdist.assess.terms.correlated import (
     LocalErrors,
     StructureErrors,
 )
-from bayesdist.assess.terms.forms import DrawnField, Functions, Image, Known, Row
+from bayesdist.assess.terms.forms import DrawnField, Image, Known, Row
+from bayesdist.assess.terms.functions import Functions
 from bayesdist.assess.terms.given import Centroids
 from bayesdist.assess.terms.parameters import (
     CatalogueErrors,

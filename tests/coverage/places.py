@@ -16,7 +16,7 @@ from bayesdist.assess.budget_surface import JOINT as MODEL
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.drawn import DrawnErrors
 from bayesdist.assess.terms.correlated import STRUCTURE_IN_FIT
-from bayesdist.assess.terms.forms import PolynomialField
+from bayesdist.assess.terms.functions import PolynomialField
 from bayesdist.assess.terms.given import CENTROID
 from bayesdist.assess.terms.parameters import COEFFICIENTS, TIME_DEPENDENCE
 from bayesdist.diagnose.correlated import Discrepancy

@@ -9,13 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from bayesdist.assess.terms.forms import (
-    LOCAL,
-    PUBLISHED,
-    ErrorTerm,
-    Functions,
-    Row,
-)
+from bayesdist.assess.terms.forms import LOCAL, PUBLISHED, ErrorTerm, Row
+from bayesdist.assess.terms.functions import Functions
 from bayesdist.assess.terms.given import (
     UserTerm,
     is_stated,

@@ -20,14 +20,13 @@ from bayesdist.assess.terms.forms import (
     LOCAL,
     MEASURED,
     ErrorDraws,
-    Functions,
     Image,
     Independent,
-    Polynomials,
     Pool,
     Row,
     Together,
 )
+from bayesdist.assess.terms.functions import Functions, Polynomials
 from bayesdist.diagnose.correlated import Discrepancy
 from bayesdist.diagnose.correlated.deviations import LinearDeviations
 from bayesdist.diagnose.tables import BetweenNodes, MeanSquare

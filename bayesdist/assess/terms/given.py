@@ -17,12 +17,12 @@ from bayesdist.assess.terms.forms import (
     PUBLISHED,
     ErrorDraws,
     ErrorTerm,
-    Functions,
     Independent,
     Pool,
     Row,
     SizedTerm,
 )
+from bayesdist.assess.terms.functions import Functions
 from bayesdist.assess.units import convert
 from bayesdist.data.magnitude_errors import MagnitudeErrors
 from bayesdist.data.tables.column import UNITS

@@ -17,14 +17,12 @@ from bayesdist.assess.terms.forms import (
     ErrorDraws,
     ErrorTerm,
     Image,
-    PolynomialField,
-    Polynomials,
     Pool,
     Row,
     Together,
     TogetherField,
-    polynomial_errors,
 )
+from bayesdist.assess.terms.functions import PolynomialField, Polynomials, polynomial_errors
 from bayesdist.errors import InputError, require_known
 from bayesdist.infer.catalogue.star_errors import StarCovariance
 from bayesdist.infer.solution.solution import Solution

@@ -13,7 +13,8 @@ from scipy.spatial.distance import cdist
 
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.solution import place_of
-from bayesdist.assess.terms.forms import FunctionField, Functions, Image, Pool, Row
+from bayesdist.assess.terms.forms import Image, Pool, Row
+from bayesdist.assess.terms.functions import FunctionField, Functions
 from bayesdist.assess.terms.given import SMOOTH_DRAWS
 from bayesdist.model import DistortionModel
 from bayesdist.model.grid import grid_pixels, mesh
