@@ -154,3 +154,22 @@ def test_the_list_finds_what_it_is_for():
         assert hits(said), said
     for good in ("in place of [data]", "two stars share an error", "the fraction of false matches"):
         assert not hits(good), good
+
+
+ERRORS = {"FormatError", "InputError", "ConfigError", "DegenerateError", "MemoryLimitError"}
+# the function `required`, whose conditions hold by construction
+EXEMPT = {("errors.py", "InputError(cause)")}
+
+
+def test_every_error_says_what_to_do():
+    """An error for users has an argument `do`, so that its sentence ends with the next action."""
+    without = [
+        f"{path.relative_to(PACKAGE)}:{call.lineno}"
+        for path in sorted(PACKAGE.rglob("*.py"))
+        for call in ast.walk(ast.parse(path.read_text("utf-8")))
+        if isinstance(call, ast.Call)
+        and getattr(call.func, "id", "") in ERRORS
+        and not any(keyword.arg in ("do", None) for keyword in call.keywords)
+        and (path.name, ast.unparse(call)) not in EXEMPT
+    ]
+    assert without == []

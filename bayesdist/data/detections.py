@@ -170,7 +170,11 @@ def detections_of(
     with_mag = [stars.mag is not None for stars in lists]
     if any(with_mag) and not all(with_mag):
         bare = lists[with_mag.index(False)]
-        raise InputError("has no magnitudes, although other lists do", where=bare.source)
+        raise InputError(
+            "has no magnitudes, although other lists do",
+            where=bare.source,
+            do="add them, or drop the column from all lists",
+        )
     n = [len(stars) for stars in lists]
     errors: dict[str, Any] = {}
     if sigma is not None:

@@ -275,7 +275,11 @@ def build(
     chip_map = calibration.with_tables(calibration.at(options.epoch, origin="stated"))[number]
     nx, ny = (int(n) for n in chip_map.basis.size)
     if nx * ny > _LARGEST:
-        raise InputError(f"the detector has {nx} x {ny} pixels", where="products.stdgdc")
+        raise InputError(
+            f"the detector has {nx} x {ny} pixels, more than the {_LARGEST:,} of an STDGDC file",
+            where="products.stdgdc",
+            do="choose another format",
+        )
     x, y = detector_grid(chip_map.basis.size, 65)
     areas = np.linalg.det(chip_map.slope(x, y)) / np.linalg.det(chip_map.linear)
     U, V = chip_map.at(x, y)

@@ -150,13 +150,20 @@ class DistortionModel(EffectiveCoefficients):
         if np.issubdtype(exposure.dtype, np.integer):
             codes = exposure.astype(np.int64)
             if codes.size and not (codes.min() >= 0 and codes.max() < len(self.exposures)):
-                raise InputError(f"exposure codes must be from 0 to {len(self.exposures) - 1}")
+                raise InputError(
+                    f"exposure codes must be from 0 to {len(self.exposures) - 1}",
+                    do="give the codes or the names of exposures of this model",
+                )
             return codes
         code_of = {name: code for code, name in enumerate(self.exposures)}
         flat = [str(name) for name in np.atleast_1d(exposure).ravel()]
         unknown = [name for name in flat if name not in code_of]
         if unknown:
-            raise InputError(f"there is no exposure {unknown[0]!r}")
+            raise InputError(
+                f"there is no exposure {unknown[0]!r}",
+                do=f"choose one of the {len(self.exposures)} exposures of the model, the first of "
+                f"which is {self.exposures[0]!r}",
+            )
         return np.array([code_of[name] for name in flat], np.int64).reshape(np.shape(exposure))
 
     def drift_terms(self, chip: int | None = None) -> Float:
@@ -367,7 +374,8 @@ class DistortionModel(EffectiveCoefficients):
         if theta.shape[-1:] != (self.n_params,):
             raise InputError(
                 f"theta has {theta.shape[-1] if theta.ndim else 0} values, but the model has "
-                f"{self.n_params} parameters"
+                f"{self.n_params} parameters",
+                do="give one value per parameter, in the order of `names`",
             )
         return theta
 

@@ -215,7 +215,9 @@ def binned_sums(
         raise InputError(f"the number of bins is {bins}", do="give whole numbers of at least 1")
     columns = [np.asarray(a, float) for a in (x, y, ru, rv, *more)]
     if columns[0].ndim != 1 or len({a.shape for a in columns}) != 1:
-        raise InputError("positions and residuals differ in length")
+        raise InputError(
+            "positions and residuals differ in length", do="give one residual for each position"
+        )
 
     def sums_from(start: int) -> BinnedSums:
         """Sums of one block, small enough for its temporary arrays to stay in the cache."""

@@ -290,7 +290,10 @@ def star_covariance(
     code = matches.star
     errors = errors.checked(int(code.max()) + 1)
     if errors.motion is not None and matches.epoch is None:
-        raise InputError("errors of proper motions need the epochs of the matches")
+        raise InputError(
+            "errors of proper motions need the epochs of the matches",
+            do="give a column 'epoch', or leave out the errors of motions",
+        )
     levers, variances = errors.levers(code, matches.epoch), errors.variances
     _require_contained(matches, code, errors)
     stars, order = prepare(solution.model, matches)

@@ -75,7 +75,11 @@ class GaussianPriors:
                     do=f"did you mean {near[0]!r}" if near else "see coefficients.ecsv for names",
                 )
             if not (np.isfinite(mean) and 0 < sigma < np.inf):
-                raise InputError(f"prior of {name} is {mean} +- {sigma}", where="prior")
+                raise InputError(
+                    f"prior of {name} is {mean} +- {sigma}",
+                    where="prior",
+                    do="give a finite mean and a positive finite sigma",
+                )
             k = model.names.index(name)
             centre[k], precision[k] = mean, sigma**-2
         return cls(centre, precision)

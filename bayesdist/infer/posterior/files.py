@@ -204,7 +204,7 @@ def load_posterior(path: str | Path) -> Posterior:
         if attrs.get("creator") != "bayesdist":
             raise KeyError("creator")
         if attrs.get("schema") != SCHEMA:
-            raise FormatError(f"schema {attrs.get('schema')} is not {SCHEMA}")
+            raise FormatError(f"schema {attrs.get('schema')} is not {SCHEMA}", do="sample again")
         mixture = _tree(attrs["mixture"])
         mixture["fraction_prior"] = tuple(mixture["fraction_prior"])
         info: dict[str, Any] = {str(k): _plain(v) for k, v in stats.attrs.items()}
@@ -289,13 +289,18 @@ def _refuse_changed(groups: Mapping[str, NetcdfGroup]) -> None:
     """Raise FormatError if the content of a file contradicts its checksum."""
     attrs = groups[""].attrs
     if "checksum" not in attrs:
-        raise FormatError("it has no checksum: an earlier revision of bayesdist wrote it")
+        raise FormatError(
+            "it has no checksum: an earlier revision of bayesdist wrote it", do="sample again"
+        )
     try:
         agrees = attrs["checksum"] == _checksum(groups, _tree(attrs["checked"]))
     except KeyError:
         agrees = False
     if not agrees:
-        raise FormatError("its content contradicts its checksum: it is damaged or was changed")
+        raise FormatError(
+            "its content contradicts its checksum: it is damaged or was changed",
+            do="restore it, or sample again",
+        )
 
 
 def _tree(text: object) -> Any:

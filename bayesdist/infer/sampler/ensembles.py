@@ -138,7 +138,12 @@ class Ensembles:
         batches, W = [self.pilot], self.plan.walkers
         while (fewest := min(len(_usable(batches, e)) for e in range(len(self.seeds)))) < W:
             if len(batches) > START_BATCHES:
-                raise InputError("the proposal has no mass inside the support", where="sampler")
+                raise InputError(
+                    "hardly any state that is proposed is inside the support of the priors",
+                    where="sampler",
+                    do="widen the priors, or check the least-squares fit on which proposals are "
+                    "centred",
+                )
             key = (0, len(batches))
             batches.append(draw_batch(self.target, self.proposal, self.seeds, key, W - fewest))
         n = self.pilot.psi.shape[1]

@@ -249,7 +249,10 @@ def groups_of(model: DistortionModel, matches: Matches) -> Groups:
     exposure, or lack required epochs.
     """
     if matches.unit != model.unit:
-        raise InputError(f"the matches are in {matches.unit}, but the model is in {model.unit}")
+        raise InputError(
+            f"the matches are in {matches.unit}, but the model is in {model.unit}",
+            do=f"convert the matches to {model.unit}",
+        )
     return model.groups(
         len(matches), epoch=matches.epoch, exposure=matches.exposure, chip=matches.chip_number
     )

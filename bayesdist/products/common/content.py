@@ -89,7 +89,10 @@ class Hdu:
         Raises FormatError if this is not a binary table, or if its cards cannot be read.
         """
         if self.header.get("XTENSION", "").strip() != "BINTABLE":
-            raise FormatError(f"HDU {self.name!r} is not a binary table")
+            raise FormatError(
+                f"HDU {self.name!r} is not a binary table",
+                do="it is damaged: fetch or write it again",
+            )
         try:
             hdu = fits.BinTableHDU.fromstring(self.to_bytes())
             refuse_long_arrays(hdu, Budget(f"HDU {self.name!r}", len(self.data)))

@@ -162,6 +162,7 @@ def printed_rows(text: str) -> dict[str, PrintedRow]:
             raise InputError(
                 f"a row of statistics is a label and {len(STATISTICS)} numbers, not {line!r}",
                 where=f"row {k}",
+                do="correct the row",
             )
         value = {n: float(d) for n, d in zip(STATISTICS, decimals, strict=True)}
         half = {
