@@ -23,7 +23,7 @@ def sketched(*, made: bool = True) -> Iterator[None]:
     Figures of a run that are not `made` have their names in place of words.
     """
     from bayesdist.report import drawing, run_report
-    from bayesdist.report.sections.run import posterior
+    from bayesdist.report.sections import posterior
 
     with (
         patch.object(drawing, "render", _sketch),

@@ -21,7 +21,7 @@ def report(run: Run, *, pdf: bool = False) -> list[str]:
     # imported here because plotting takes seconds to import
     from bayesdist.report.drawing import save_drawings
     from bayesdist.report.run_report import draw_report, write_report
-    from bayesdist.report.sections.run.status import verdict
+    from bayesdist.report.sections.status import verdict
 
     directory = run.directory
     drawings = draw_report(run, pdf=pdf, processes=2 if _is_command_line() else 1)

@@ -1,14 +1,19 @@
-"""A run as the report reads it, and texts of its lengths and positions."""
+"""A run as the report reads it: its members, and texts of its lengths, positions, gauge and kind.
+
+A change that is common to all frames is equivalent to a change of the polynomials. Shift and
+rotation of a solution are therefore meaningless until their zero points are defined.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
 from bayesdist.assess.solution import chip_places
 from bayesdist.calibration.plane import ARCSEC
-from bayesdist.report.figures.mosaic import Mosaic
+from bayesdist.model import Chip
 from bayesdist.utils.text import MISSING, count, number, with_mas
 
 if TYPE_CHECKING:
@@ -21,7 +26,10 @@ if TYPE_CHECKING:
     from bayesdist.infer import LinearFit, Posterior
     from bayesdist.infer.catalogue.added_errors import GroupedErrors
     from bayesdist.model import Chip, DistortionModel, LookupTable
-    from bayesdist.report.words import Terminology
+
+Size = tuple[float, float]
+
+MAX_COLUMNS = 3  # of panels; more would be too narrow
 
 
 class AssumedErrors(Protocol):
@@ -226,3 +234,100 @@ def sample_words(run: ReportedRun) -> str:
     if not stars.partial:
         return ""
     return f"a sample of {count(len(stars))} of {count(stars.n_total)} {run.kind.words.rows}"
+
+
+def gauge_mark(run: ReportedRun) -> str:
+    """Clause of a caption about the gauge; empty if a single system leaves no choice."""
+    return ", in the fit's own gauge" if run.model.n_frame else ""
+
+
+def gauge_note(run: ReportedRun) -> str:
+    """Sentences on the gauge of the fit; empty if there is no choice."""
+    model = run.model
+    if not model.n_frame:
+        return ""
+    first = model.exposures[0]
+    if model.gauge == "first":
+        return f"The fit's own gauge: the polynomials are those of exposure {first}, as it lies."
+    chip = model.chips[0].name
+    return (
+        f"The fit's own gauge: exposure {first} is held where its own stars on {chip} put it, so"
+        f" that shift and rotation of {chip} are near zero, and not exactly zero. The linear terms"
+        f" against time are in another gauge, in which they are."
+    )
+
+
+def gauge_of_maps(run: ReportedRun) -> str:
+    """Sentence on shift and rotation in the maps of the uncertainty; empty without frames."""
+    if not run.model.n_frame:
+        return ""
+    return run.kind.words.gauge_of_maps.format(first=run.model.exposures[0])
+
+
+@dataclass(frozen=True)
+class Mosaic:
+    """Arrangement of the chips of a detector."""
+
+    sizes: tuple[Size, ...]  # columns and rows of each chip, pixels
+    names: tuple[str, ...] = ("",)  # shown if there are several chips
+    places: tuple[tuple[int, int], ...] = ((0, 0),)  # row (0 at the top) and column of each chip
+
+    @classmethod
+    def of_chips(cls, chips: Sequence[Chip], places: Sequence[tuple[int, int]]) -> Mosaic:
+        """Arrangement of the chips of a model, with their names if there are several."""
+        names = tuple(chip.name if len(chips) > 1 else "" for chip in chips)
+        return cls(tuple(chip.size for chip in chips), names, tuple(places))
+
+    @property
+    def several(self) -> bool:
+        """True if there is more than one chip."""
+        return len(self.sizes) > 1
+
+    @property
+    def largest(self) -> Size:
+        """Numbers of columns and rows that are sufficient for every chip."""
+        return max(s[0] for s in self.sizes), max(s[1] for s in self.sizes)
+
+    @property
+    def longest_side(self) -> float:
+        """Longest side of a chip, in pixels."""
+        return max(self.largest)
+
+    @property
+    def legible_places(self) -> tuple[tuple[int, int], ...]:
+        """Row and column of each chip; a wide detector is wrapped to fewer columns."""
+        if max(column for _, column in self.places) < MAX_COLUMNS:
+            return self.places
+        order = sorted(self.places)
+        return tuple(divmod(order.index(place), MAX_COLUMNS) for place in self.places)
+
+
+@dataclass(frozen=True)
+class Terminology:
+    """Words of messages and reports that differ between the kinds of runs."""
+
+    rows: str = "stars"  # name of the rows that are fitted
+    all_rows: str = "matched stars"  # name of the rows before rejection
+    false_rows: str = "false matches"
+    rejection: str = "least-squares fit"  # sampling itself rejects nothing
+    fit: str = "linear fit"  # the fit before sampling
+    fit_title: str = "Least-squares fit"  # of its section
+    constraint: str = "a prior"  # on parameters that the data do not constrain
+    leverage: str = ""  # clause on why residuals are smaller than errors; may be empty
+    # True to print the general sections on the data; False if those of the kind say more
+    prints_data: bool = True
+    held: str = (  # parameters that the data do not constrain
+        "Held, and therefore not shown: a prior alone says what these parameters are, and the data"
+        " add nothing to it"
+    )
+    # clauses and sentences on the exposures that errors of positions hold for; may be empty
+    whom: str = ""
+    new_exposure: str = ""
+    # clause on a common shift and rotation in errors of positions of several exposures
+    with_shift: str = ", shift and rotation included"
+    gauge_of_maps: str = (  # `first`: the first exposure
+        "Shift and rotation of the detector as a whole count as errors here, relative to exposure"
+        " {first}."
+    )
+    relative_map: str = ""  # sentence on the map of relative positions, if it is shown
+    residuals: str = ""  # sentence on the binned residuals; may be empty

@@ -53,7 +53,7 @@ from bayesdist.app.artefacts.parts import Part
 from bayesdist.assess.terms.parameters import ScaleError
 from bayesdist.data import Matches
 from bayesdist.infer import GaussianPriors, build_model, fit_linear
-from bayesdist.report.words import Terminology
+from bayesdist.report.run import Terminology
 from bayesdist.utils.checks import Check
 
 

@@ -9,7 +9,7 @@ from lxml import html as lxml_html
 
 from bayesdist.app.commands.on_runs.overview import overview
 from bayesdist.errors import InputError
-from bayesdist.report.overview import OverviewRow, write_overview
+from bayesdist.report.run_report import OverviewRow, write_overview
 from tests.app.support import cli
 
 ROW = OverviewRow(

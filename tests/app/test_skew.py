@@ -9,7 +9,7 @@ from scipy import stats
 
 from bayesdist.infer import Rejection, fit_linear, load_fit, load_posterior
 from bayesdist.infer.solution.geometry import skew_of
-from bayesdist.report.sections.run.fit import fit_tables
+from bayesdist.report.sections.fit import fit_tables
 from tests.app.support import (
     CENTRE,
     as_table,

@@ -11,7 +11,7 @@ from lxml import html as lxml_html
 from bayesdist.assess.budget import BudgetTerm
 from bayesdist.report.contents import REPORT
 from bayesdist.report.run_report import render_report
-from bayesdist.report.sections.run.budget import budget_table
+from bayesdist.report.sections.budget import budget_table
 
 
 @pytest.fixture

@@ -23,8 +23,8 @@ from bayesdist.missions.hst.simulate.distortion import DRIFT
 from bayesdist.model import TimeDependence
 from bayesdist.report.run_report import render_report
 from bayesdist.report.sections import REPORT
-from bayesdist.report.sections.run.coefficients import _parameter_table, coefficient_tables
-from bayesdist.report.sections.run.fit import fit_tables
+from bayesdist.report.sections.fit import fit_tables
+from bayesdist.report.sections.posterior import _parameter_table, coefficient_tables
 from bayesdist.report.texttable import check_cells
 
 from . import campaigns

@@ -8,7 +8,7 @@ from dataclasses import replace
 from lxml import html as lxml_html
 
 from bayesdist.report.run_report import render_report
-from bayesdist.report.sections.run.provenance import config_hash, document_id
+from bayesdist.report.sections.provenance import config_hash, document_id
 
 
 def test_the_hash_is_that_of_the_configuration_whatever_the_order_of_keys(converged):

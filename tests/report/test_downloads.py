@@ -11,11 +11,11 @@ import numpy as np
 from lxml import html as lxml_html
 
 from bayesdist.report.contents import explanation_of, section_of
-from bayesdist.report.figures.figure_numbers import numbers_of
+from bayesdist.report.drawing import numbers_of
 from bayesdist.report.run import shown_residuals
 from bayesdist.report.run_report import render_report
 from bayesdist.report.sections import REPORT
-from bayesdist.report.sections.run.status import GROUPS
+from bayesdist.report.sections.status import GROUPS
 
 from .plots import drawings_of, plot_of
 

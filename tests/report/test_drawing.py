@@ -19,8 +19,13 @@ from PIL import Image
 from bayesdist.report import drawing
 from bayesdist.report.contents import Item, Plot
 from bayesdist.report.drawing import DPI, MARGIN, png_of, render
-from bayesdist.report.figures.style import figure_style, new_figure, plain_ticks
-from bayesdist.report.figures.ticks import OneTickAxes, OneTickFigure
+from bayesdist.report.figures.style import (
+    OneTickAxes,
+    OneTickFigure,
+    figure_style,
+    new_figure,
+    plain_ticks,
+)
 from bayesdist.report.page import picture_of
 from bayesdist.report.sections import REPORT
 

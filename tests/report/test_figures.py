@@ -26,7 +26,6 @@ from bayesdist.report.figures.fields import (
     error_levels,
     scalar_map,
 )
-from bayesdist.report.figures.mosaic import Mosaic
 from bayesdist.report.figures.panels import ChipPanels, FocalPlane, overlap
 from bayesdist.report.figures.style import figure_style, nice_below
 from bayesdist.report.plots.posterior import (
@@ -35,9 +34,9 @@ from bayesdist.report.plots.posterior import (
     slowest_parameters,
 )
 from bayesdist.report.plots.residuals import MixtureCurve
-from bayesdist.report.run import shown_maps
-from bayesdist.report.sections.run.data import _density
-from bayesdist.report.sections.run.residuals import _histograms
+from bayesdist.report.run import Mosaic, shown_maps
+from bayesdist.report.sections.fit import _density
+from bayesdist.report.sections.residuals import _histograms
 from tests.reduced import case_in_full
 
 from .plots import figures_of

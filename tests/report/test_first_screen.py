@@ -11,7 +11,7 @@ from lxml import html as lxml_html
 
 from bayesdist.report.drawing import Drawing
 from bayesdist.report.run_report import render_report
-from bayesdist.report.sections.run.status import (
+from bayesdist.report.sections.status import (
     facts_line,
     requirement_lines,
     status_table,

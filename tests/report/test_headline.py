@@ -11,8 +11,8 @@ from bayesdist.assess.requirements.margins import ValidityPeriod
 from bayesdist.assess.requirements.verdict import catalogue_checks
 from bayesdist.report.contents import section_of
 from bayesdist.report.sections import REPORT
-from bayesdist.report.sections.run.provenance import product_table
-from bayesdist.report.sections.run.status import status_checks, status_table, verdict
+from bayesdist.report.sections.provenance import product_table
+from bayesdist.report.sections.status import status_checks, status_table, verdict
 from bayesdist.utils.checks import GROUPS, LARGER, Check
 
 from .runs import written

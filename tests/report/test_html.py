@@ -18,9 +18,9 @@ from bayesdist.errors import InputError
 from bayesdist.infer.posterior.checks import sampling_checks
 from bayesdist.report.run_report import render_report, write_report
 from bayesdist.report.sections import REPORT
-from bayesdist.report.sections.run.coefficients import coefficient_tables
-from bayesdist.report.sections.run.fit import fit_tables
-from bayesdist.report.sections.run.status import status_checks, verdict
+from bayesdist.report.sections.fit import fit_tables
+from bayesdist.report.sections.posterior import coefficient_tables
+from bayesdist.report.sections.status import status_checks, verdict
 
 from .runs import report_run, written
 

@@ -11,7 +11,7 @@ from scipy.stats import norm
 from bayesdist.diagnose.residuals.binned import binned_residuals
 from bayesdist.report.figures.arrows import CHANCE, significant_cells
 from bayesdist.report.plots.residuals import MixtureCurve
-from bayesdist.report.sections.run.posterior import outlier_table
+from bayesdist.report.sections.posterior import outlier_table
 
 
 def test_counts_add_up_to_the_stars():

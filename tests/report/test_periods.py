@@ -16,7 +16,7 @@ from bayesdist.model import Chip, DistortionModel
 from bayesdist.report.figures.commands import order_comparison
 from bayesdist.report.figures.style import INK, PALE
 from bayesdist.report.run_report import render_report
-from bayesdist.report.sections.run.periods import period_tables
+from bayesdist.report.sections.periods import period_tables
 
 from .plots import plot_of
 from .runs import report_run

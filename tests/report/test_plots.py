@@ -24,8 +24,8 @@ from bayesdist.assess.requirements.margins import ValidityPeriod
 from bayesdist.assess.vectors import diagram_vectors
 from bayesdist.errors import InputError
 from bayesdist.report import html, plots
+from bayesdist.report.drawing import numbers_of
 from bayesdist.report.figures.arrows import Arrows
-from bayesdist.report.figures.figure_numbers import numbers_of
 from bayesdist.report.figures.style import INK, PAPER, Tones
 from bayesdist.report.plots import errors, maps
 from bayesdist.report.plots.posterior import Column, contour_heights, draw_corner

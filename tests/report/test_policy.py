@@ -19,8 +19,7 @@ from lxml import html as lxml_html
 from bayesdist.assess import Requirement, UserTerm
 from bayesdist.assess.budget_surface import budget_surface
 from bayesdist.assess.model import error_model
-from bayesdist.report.overview import OverviewRow, write_overview
-from bayesdist.report.run_report import render_report, write_report
+from bayesdist.report.run_report import OverviewRow, render_report, write_overview, write_report
 from bayesdist.utils.checks import Check
 from tests.budgets import detector_budget
 

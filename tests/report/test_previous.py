@@ -9,7 +9,7 @@ import bayesdist as bd
 from bayesdist.app.calibrations import difference_from_previous
 from bayesdist.errors import InputError
 from bayesdist.report.run_report import render_report
-from bayesdist.report.sections.run.previous import previous_difference, previous_table
+from bayesdist.report.sections.periods import previous_difference, previous_table
 
 SIZE = 1000
 QUADRATIC = 0.4  # pixels, of u along x at the edge, which the new calibration adds

@@ -28,7 +28,7 @@ from bayesdist.infer.catalogue.star_errors import StarErrors
 from bayesdist.infer.exposures.hierarchy import Settling
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.model import DistortionModel, LookupTable
-from bayesdist.report.words import Terminology
+from bayesdist.report.run import Terminology
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.checks import Check
 

@@ -47,7 +47,7 @@ from bayesdist.kinds.campaign.matching import (
     match_lists,
     overlap_of,
 )
-from bayesdist.report.words import Terminology
+from bayesdist.report.run import Terminology
 from bayesdist.utils.checks import COMPLETENESS, FALSE_MATCHES, LARGER, Check, level_of
 from bayesdist.utils.text import count, percent
 

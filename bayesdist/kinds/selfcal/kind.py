@@ -27,7 +27,7 @@ from bayesdist.kinds.selfcal.inputs import (
 )
 from bayesdist.kinds.selfcal.matching import load_matched_selfcal, match_dithers, selfcal_lines
 from bayesdist.kinds.selfcal.patterns.dithers import further_dithers
-from bayesdist.report.words import Terminology
+from bayesdist.report.run import Terminology
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.checks import Check
 

@@ -13,7 +13,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from bayesdist.report.figures.arrows import Arrows, vector_map
-from bayesdist.report.figures.mosaic import Mosaic
 from bayesdist.report.figures.panels import ChipPanels
 from bayesdist.report.figures.style import (
     COLORBAR,
@@ -27,6 +26,7 @@ from bayesdist.report.figures.style import (
     new_figure,
     nice_below,
 )
+from bayesdist.report.run import Mosaic
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.distributions import chi2_ppf, chi2_sf, norm_isf
 from bayesdist.utils.text import display_scale, size_of

@@ -12,7 +12,6 @@ from matplotlib.patches import Polygon, Rectangle
 from matplotlib.patheffects import withStroke
 
 from bayesdist.assess.solution import ChipFrame
-from bayesdist.report.figures.mosaic import Mosaic
 from bayesdist.report.figures.style import (
     HALF_WIDTH,
     INK,
@@ -23,6 +22,7 @@ from bayesdist.report.figures.style import (
     figure_style,
     new_figure,
 )
+from bayesdist.report.run import Mosaic
 from bayesdist.utils.arrays import Float
 
 Size = tuple[float, float]

@@ -13,7 +13,7 @@ from bayesdist.app.config import config_of_record
 from bayesdist.app.screen import table_text
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.store.summary import head_of
-from bayesdist.report.overview import OverviewRow, write_overview
+from bayesdist.report.run_report import OverviewRow, write_overview
 from bayesdist.utils.text import with_mas
 
 log = logging.getLogger("bayesdist")

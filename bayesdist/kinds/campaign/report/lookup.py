@@ -22,7 +22,7 @@ from bayesdist.report.figures.fields import Grid, scalar_map
 from bayesdist.report.figures.panels import ChipPanels
 from bayesdist.report.figures.style import OUTLINE, PALETTE, WIDTH, new_figure, nice_below
 from bayesdist.report.run import ReportedRun, mosaic_of
-from bayesdist.report.sections.run.residuals import residual_panels
+from bayesdist.report.sections.residuals import residual_panels
 from bayesdist.report.texttable import TextTable, listing, tabulated
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.text import count, display_scale, number, size_of

@@ -14,7 +14,7 @@ from bayesdist.missions.wise.assess.account import LONGEST_DIFFERENCES, RowAccou
 from bayesdist.missions.wise.assess.residual_tables import HEADS, PrintedRow
 from bayesdist.missions.wise.bands.context import BANDS, BandResult, BandsInput, Printed
 from bayesdist.missions.wise.bands.figures import CASES, below_draws, chance_of
-from bayesdist.report.sections.run.status import Verdict
+from bayesdist.report.sections.status import Verdict
 from bayesdist.report.texttable import TextTable, listing
 from bayesdist.utils.text import MISSING, count, number, percent, probability, rounded, size_of
 

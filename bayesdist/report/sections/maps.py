@@ -28,6 +28,8 @@ from bayesdist.report.figures.style import nice_below
 from bayesdist.report.plots.maps import BORDER, KEY_PAD
 from bayesdist.report.run import (
     ReportedRun,
+    gauge_mark,
+    gauge_of_maps,
     has_several_chips,
     length_text,
     marked,
@@ -36,7 +38,6 @@ from bayesdist.report.run import (
     scale_mas,
     shown_maps,
 )
-from bayesdist.report.sections.gauge import gauge_mark, gauge_of_maps
 from bayesdist.report.texttable import TextTable, tabulated
 from bayesdist.utils.text import display_scale, number, size_of, with_mas
 

@@ -24,7 +24,7 @@ from bayesdist.report.run import (
     scale_mas,
     setting,
 )
-from bayesdist.report.sections.run.provenance import checks_of_file, written_files
+from bayesdist.report.sections.provenance import checks_of_file, written_files
 from bayesdist.report.texttable import TextTable, check_cells
 from bayesdist.utils.checks import GROUPS, LEVELS, Check, doubts_of, warnings_of, worst
 from bayesdist.utils.text import count, counted, rounded, with_mas

@@ -1,1 +1,0 @@
-"""Sections that every run has."""
