@@ -69,6 +69,7 @@ class ReferenceBlock(Section):
     epoch: Epoch | None = None
     tangent_point: tuple[float, float] | None = None
     radius: PositiveFloat = 2.0
+    motion_prior: PositiveFloat | None = None  # mas per year
 
 
 class GaugeBlock(Section):

@@ -251,6 +251,7 @@ def _read_references(config: SelfcalConfig, base: Path) -> ReferenceCatalog | No
         unit=block.unit,
         epoch=block.epoch,
         tangent_point=block.tangent_point,
+        motion_prior=block.motion_prior,
     )
     if catalog.sigma_u is None or catalog.sigma_v is None:
         raise InputError(

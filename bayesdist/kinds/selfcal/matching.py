@@ -246,6 +246,12 @@ def matching_facts(found: SelfCalibration, inputs: Inputs) -> MatchingFacts:
             f"{friends.n_ambiguous} groups of detections are ambiguous beside {p.n_stars} stars: "
             "the field is crowded for this match radius"
         )
+    if inputs.catalog is not None and inputs.catalog.pm_u is not None and p.dates is None:
+        warnings.append(
+            "the reference stars have proper motions, and the exposures have no dates: the stars "
+            "are taken where they were at the epoch of their catalogue; give selfcal.exposures "
+            "with dates"
+        )
     return {
         "n_exposures": len(d.exposure_names),
         "n_stars": p.n_stars,

@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 
 from bayesdist.data.catalog import ReferenceCatalog
 from bayesdist.data.matching.pairs import MIN_PAIRS, LinearMap, iterated_map
+from bayesdist.data.sky import parallax_factors
 from bayesdist.errors import InputError
 from bayesdist.infer.equations.priors import Prior
 from bayesdist.kinds.selfcal.grouping import MutualFrames
@@ -169,7 +170,9 @@ class ReferenceStars:
         InputError
             If fewer than two stars are identified.
         """
-        catalog = self.catalog.at(problem.epoch0) if problem.epoch0 else self.catalog
+        catalog, dates = self.catalog, problem.dates
+        if dates is not None:
+            catalog = catalog.at(float(np.mean(dates)))
         places = problem.middles(theta)
         rows, matched = self._pairs(problem, catalog, places)
         if len(rows) < MIN_REFERENCE_STARS:
@@ -181,54 +184,57 @@ class ReferenceStars:
             )
         none = StarPriors.none(problem.n_stars, problem.n_star)
         centre, precision = none.centre.copy(), none.precision.copy()
-        moving = problem.n_star >= 4 and catalog.pm_u is not None and catalog.sigma_pm_u is not None
-        if catalog.correlations is not None:
-            self._add_correlated(centre, precision, rows, catalog, matched, moving=moving)
-            return replace(none, centre=centre, precision=precision)
-        for axis, name in enumerate("uv"):
-            sigma = getattr(catalog, f"sigma_{name}")[matched]
-            centre[rows, axis] = getattr(catalog, name)[matched]
-            if not moving:
-                precision[rows, axis, axis] += sigma**-2.0
-                continue
-            # Errors of positions and proper motions are independent at the epoch of the catalogue.
-            # Here, `years` later, the position is the sum of the position and `years` times the
-            # proper motion.
-            sigma = getattr(self.catalog, f"sigma_{name}")[matched]
-            motion = getattr(self.catalog, f"sigma_pm_{name}")[matched]
-            years = (
-                problem.epoch0
-                - np.broadcast_to(np.asarray(self.catalog.epoch, float), len(self.catalog))[matched]
-            )
-            centre[rows, 2 + axis] = getattr(catalog, f"pm_{name}")[matched]
-            precision[rows, axis, axis] += sigma**-2.0
-            precision[rows, axis, 2 + axis] -= years * sigma**-2.0
-            precision[rows, 2 + axis, axis] -= years * sigma**-2.0
-            precision[rows, 2 + axis, 2 + axis] += motion**-2.0 + (years / sigma) ** 2
+        values, carry = self._carried(problem, rows, matched)
+        covariances = self.catalog.covariances[matched]
+        n = carry.shape[1]
+        centre[rows, :n] = np.einsum("nij,nj->ni", carry, values)
+        precision[rows, :n, :n] += np.linalg.inv(carry @ covariances @ np.swapaxes(carry, 1, 2))
         return replace(none, centre=centre, precision=precision)
 
-    def _add_correlated(
-        self,
-        centre: Float,
-        precision: Float,
-        rows: Int,
-        catalog: ReferenceCatalog,
-        matched: Int,
-        *,
-        moving: bool,
-    ) -> None:
-        """Set means and add precisions of stars `rows`, which are `matched` in the catalogue.
+    def _carried(self, problem: Problem, rows: Int, matched: Int) -> tuple[Float, Float]:
+        """Parameters of the catalogue, and their derivatives for those of the stars.
 
-        `catalog` is the catalogue at the date of the stars' positions.
+        The first are u, v, parallax, pm_u and pm_v (n, 5) of the catalogue's stars `matched`.  The
+        second (n, k, 5) are the derivatives, with respect to them, of the first k parameters of the
+        problem's stars `rows`: of the position, of the motion if it is fitted and the catalogue has
+        motions with errors, and of the parallax likewise.  Stars without a fitted motion or
+        parallax are where they are on average over their detections.
         """
-        names = ("u", "v", "pm_u", "pm_v")[: 4 if moving else 2]
-        n = len(names)
-        centre[rows[:, None], np.arange(n)] = np.column_stack(
-            [getattr(catalog, name)[matched] for name in names]
-        )
-        which = np.array([0, 1, 3, 4])[:n]
-        covariances = catalog.covariances[matched[:, None, None], which[:, None], which]
-        precision[rows, :n, :n] += np.linalg.inv(covariances)
+        catalog, dates = self.catalog, problem.dates
+        columns = (catalog.u, catalog.v, catalog.parallax, catalog.pm_u, catalog.pm_v)
+        values = np.zeros((len(matched), len(columns)))
+        for k, column in enumerate(columns):
+            if column is not None:
+                values[:, k] = column[matched]
+        n = 2
+        if problem.n_star >= 4 and catalog.pm_u is not None and catalog.sigma_pm_u is not None:
+            n = 4
+            sigma = catalog.sigma_parallax
+            if problem.n_star == 5 and catalog.parallax is not None and sigma is not None:
+                n = 5 if (sigma[matched] > 0).all() else 4
+        carry = np.zeros((len(matched), n, len(columns)))
+        carry[:, :2, :2] = np.eye(2)
+        if n >= 4:
+            carry[:, 2:4, 3:] = np.eye(2)
+        if n == 5:
+            carry[:, 4, 2] = 1.0
+        if dates is None:
+            return values, carry
+        mean = np.add.reduceat(dates, problem.starts[:-1]) / problem.counts
+        when = np.full(len(rows), problem.epoch0) if problem.n_star >= 4 else mean[rows]
+        if catalog.pm_u is not None and catalog.epoch is not None:
+            years = when - np.broadcast_to(np.asarray(catalog.epoch, float), len(catalog))[matched]
+            carry[:, :2, 3:] = years[:, None, None] * np.eye(2)
+        if (
+            problem.n_star < 5
+            and catalog.parallax is not None
+            and catalog.tangent_point is not None
+        ):
+            each, of_detection = np.unique(dates, return_inverse=True)
+            factors = parallax_factors(each, *catalog.tangent_point)[of_detection]
+            sums = np.add.reduceat(factors, problem.starts[:-1], axis=0)
+            carry[:, :2, 2] = (sums / problem.counts[:, None])[rows]
+        return values, carry
 
     def _pairs(self, problem: Problem, catalog: ReferenceCatalog, places: Float) -> tuple[Int, Int]:
         """Indices of the identified stars, and of their reference stars."""

@@ -73,6 +73,7 @@ class Problem:
     match_radius: float  # largest distance in pixels of a detection from its star
     pixel: float  # median size of a pixel on the sky at the start, in the unit of u, v
     epoch0: float = 0.0  # date of the stars' positions in decimal years
+    dates: Float | None = None  # decimal years (N,) of the detections; None if they are unknown
     # known scale (E,) of the sky in each exposure about the origin of the frames
     dilation: Float | None = None
     # inverse covariances (N, 2, 2) of x and y times `var`, of determinant 1; None if errors are
@@ -398,6 +399,7 @@ def prepare(
         match_radius=match_radius,
         pixel=np.nan,
         epoch0=epoch0,
+        dates=None if detections.epoch is None else np.asarray(detections.epoch, float)[exposure],
         dilation=None if dilation is None else np.asarray(dilation, float),
         shape=shape,
     )
