@@ -20,7 +20,7 @@ from bayesdist.calibration.modeling import plane_model, sky_model
 from bayesdist.calibration.plane import Plane, SkyPlacement
 from bayesdist.calibration.sky_positions import placement_of, plane_covariances, sky_positions
 from bayesdist.errors import BayesdistError, InputError
-from bayesdist.infer.solution.solution import LinearMap
+from bayesdist.infer.solution.solution import ParameterMap
 from bayesdist.infer.solution.transforms import at_exposure
 from bayesdist.plugin import load_object
 from bayesdist.utils.arrays import Bool, Float
@@ -459,7 +459,7 @@ class CalibrationWCS(BaseLowLevelWCS, HighLevelWCSMixin):
         source = GaussianSolution(model, chip_map.coefficients.ravel(), cov)
         return Calibration(
             self.calibration.name,
-            source.transformed(model, LinearMap(matrix), matrix),
+            source.transformed(model, ParameterMap(matrix), matrix),
             Plane("sky", point=placement.point),
             errors=self.calibration.errors,
             notes=self.calibration.notes,

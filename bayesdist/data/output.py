@@ -54,7 +54,7 @@ class GeometryHeader(TypedDict, total=False):
     unit: str  # of the match radius
 
 
-class Geometry(TypedDict, total=False):
+class GeometryArguments(TypedDict, total=False):
     """Arguments of `Matches` from a `GeometryHeader`."""
 
     tangent_point: tuple[float, float]  # right ascension and declination, degrees
@@ -71,7 +71,7 @@ def geometry_header(matches: MatchColumns) -> GeometryHeader:
     return header
 
 
-def header_arguments(header: Mapping[str, Any], unit: str, *, source: str) -> Geometry:
+def header_arguments(header: Mapping[str, Any], unit: str, *, source: str) -> GeometryArguments:
     """Arguments of `Matches` from the header of a table that has a `geometry_header`.
 
     `unit` is that of u and v, to which the match radius is converted.  The result is empty for a
@@ -80,7 +80,7 @@ def header_arguments(header: Mapping[str, Any], unit: str, *, source: str) -> Ge
     stated = header.get(HEADER)
     if not isinstance(stated, Mapping):
         return {}
-    out: Geometry = {}
+    out: GeometryArguments = {}
     point, radius = stated.get("tangent_point"), stated.get("match_radius")
     if isinstance(point, list | tuple) and len(point) == 2:
         out["tangent_point"] = (float(point[0]), float(point[1]))

@@ -13,7 +13,7 @@ from bayesdist.utils.memory import memory_limit, size_text
 
 
 @dataclass(frozen=True)
-class Limits:
+class FileLimits:
     """Limits on the content of a file of any format.
 
     Quantities that may increase with the size of the file have two limits: an amount that any file
@@ -40,7 +40,7 @@ class Limits:
     depth: int = 64  # nesting of groups, elements or brackets; files of bayesdist have ten
 
 
-LIMITS = Limits()
+LIMITS = FileLimits()
 DAMAGED = "it is damaged, or made to exhaust the memory: fetch or write it again"
 
 
@@ -57,16 +57,16 @@ class Budget:
         Name of the file, for error messages.
     size : int
         Size of the file on disk, before decompression, in bytes.
-    limits : Limits, optional
+    limits : FileLimits, optional
         Limits that apply to files of any format; `LIMITS` by default.
     """
 
     where: str
     size: int
-    limits: Limits = LIMITS
+    limits: FileLimits = LIMITS
 
     @classmethod
-    def of_file(cls, path: PathLike, limits: Limits = LIMITS) -> Budget:
+    def of_file(cls, path: PathLike, limits: FileLimits = LIMITS) -> Budget:
         """Budget of a regular file, by its size; raises the errors of `opened`."""
         with opened(path) as stream:
             return cls(str(path), os.fstat(stream.fileno()).st_size, limits)

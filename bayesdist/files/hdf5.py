@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from bayesdist.errors import FormatError, InputError
 from bayesdist.files.atomic import atomic_path
-from bayesdist.files.budget import DAMAGED, LIMITS, Budget, Limits
+from bayesdist.files.budget import DAMAGED, LIMITS, Budget, FileLimits
 from bayesdist.files.faults import deferred_interrupts, restoring
 from bayesdist.utils.memory import size_text
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 def hdf5_arrays(
-    path: Path, names: Sequence[str] | None = None, limits: Limits = LIMITS
+    path: Path, names: Sequence[str] | None = None, limits: FileLimits = LIMITS
 ) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     """Arrays of an HDF5 file by name, and its attributes.
 
@@ -46,7 +46,7 @@ class NetcdfGroup:
     attrs: dict[str, Any]
 
 
-def netcdf_groups(path: Path, limits: Limits = LIMITS) -> dict[str, NetcdfGroup]:
+def netcdf_groups(path: Path, limits: FileLimits = LIMITS) -> dict[str, NetcdfGroup]:
     """Groups of a netCDF file by name, with '' for the top level; errors as in `hdf5_arrays`.
 
     xarray.DataTree would take five times as long, and half a second to import.
@@ -81,7 +81,7 @@ def _is_bare_dimension(dataset: h5py.Dataset) -> bool:
 
 
 @contextmanager
-def _checked(path: Path, limits: Limits = LIMITS) -> Iterator[h5py.File]:
+def _checked(path: Path, limits: FileLimits = LIMITS) -> Iterator[h5py.File]:
     """Context manager for an open file with arrays that are safe to read."""
     import h5py
 

@@ -14,7 +14,7 @@ from astropy.table.meta import get_header_from_yaml
 from numpy.typing import NDArray
 
 from bayesdist.errors import FormatError
-from bayesdist.files.budget import DAMAGED, LIMITS, Budget, Limits
+from bayesdist.files.budget import DAMAGED, LIMITS, Budget, FileLimits
 from bayesdist.files.documents import refuse_multiplied_yaml
 from bayesdist.files.regular import opened
 
@@ -27,7 +27,7 @@ _BUFFER = 2**18  # bytes; without a buffer, Arrow loads the columns of an entire
 
 
 def open_parquet(
-    path: Path, as_codes: Collection[str] = (), limits: Limits = LIMITS
+    path: Path, as_codes: Collection[str] = (), limits: FileLimits = LIMITS
 ) -> pyarrow.parquet.ParquetFile:
     """Open a Parquet file; only the part being decoded is kept in memory.
 
@@ -221,7 +221,7 @@ def refuse_long_text(column: pyarrow.ChunkedArray | pyarrow.Array, budget: Budge
             budget.refuse_content(4.0 * longest * len(column))
 
 
-def parquet_table(path: Path, limits: Limits = LIMITS) -> Table:
+def parquet_table(path: Path, limits: FileLimits = LIMITS) -> Table:
     """All rows of a Parquet file as an astropy Table; raises FormatError beyond its limits."""
     import pyarrow.parquet
 

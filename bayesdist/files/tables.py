@@ -27,7 +27,7 @@ from astropy.table.meta import get_header_from_yaml
 from astropy.utils.xml.iterparser import get_xml_iterator
 
 from bayesdist.errors import FormatError, InputError
-from bayesdist.files.budget import DAMAGED, LIMITS, Budget, Limits
+from bayesdist.files.budget import DAMAGED, LIMITS, Budget, FileLimits
 from bayesdist.files.faults import naming_faults
 from bayesdist.files.fits import (
     FITS_START,
@@ -105,7 +105,7 @@ def _mark_of_ecsv(lines: list[str]) -> str:
     return "," if any(map(_COMMAS.match, takewhile(_is_comment, lines))) else " "
 
 
-def read_ecsv(path: Path, limits: Limits = LIMITS) -> Table:
+def read_ecsv(path: Path, limits: FileLimits = LIMITS) -> Table:
     """Table of an ECSV file; for errors see `read_table`."""
     with _reading(path):
         lines = read_lines(path, limits)
@@ -126,11 +126,11 @@ def _columns_of_ecsv(lines: list[str]) -> dict[str, bool]:
     return {str(one["name"]): one["datatype"] not in ("string", "bool") for one in described}
 
 
-def _read_text(path: Path, limits: Limits) -> Table:
+def _read_text(path: Path, limits: FileLimits) -> Table:
     return parse_text_table(read_lines(path, limits), Budget.of_file(path, limits))
 
 
-def _read_separated(path: Path, limits: Limits, *, mark: str) -> Table:
+def _read_separated(path: Path, limits: FileLimits, *, mark: str) -> Table:
     """Table of a .csv or .tsv file; its separator may differ from the one its name suggests."""
     lines = read_lines(path, limits)
     rows = (line.rstrip("\r\n") for line in lines if line.strip() and not line.startswith("#"))
@@ -151,7 +151,7 @@ def _read_separated(path: Path, limits: Limits, *, mark: str) -> Table:
     return table
 
 
-def _read_votable(path: Path, limits: Limits) -> Table:
+def _read_votable(path: Path, limits: FileLimits) -> Table:
     check = VotableCheck(Budget.of_file(path, limits))
     raw, _ = read_unpacked(path, limits, check.add)
     check.end()
@@ -193,7 +193,7 @@ def _says_number(cell: str) -> bool:
     return True
 
 
-def _read_fits(path: Path, limits: Limits) -> Table:
+def _read_fits(path: Path, limits: FileLimits) -> Table:
     raw, budget = read_unpacked(path, limits)
     with open_fits(raw, budget) as hdus:
         warn_of_missing_extensions(hdus[0].header, len(hdus) - 1, str(path))
@@ -240,7 +240,7 @@ def _ldac(hdus: fits.HDUList, objects: list[fits.BinTableHDU]) -> Table:
     return out
 
 
-TABLE_SUFFIXES: dict[str, Callable[[Path, Limits], Table]] = {
+TABLE_SUFFIXES: dict[str, Callable[[Path, FileLimits], Table]] = {
     ".ecsv": read_ecsv,
     ".csv": partial(_read_separated, mark=","),
     ".tsv": partial(_read_separated, mark="\t"),
@@ -266,7 +266,7 @@ def is_fits(path: Path) -> bool:
     return head_of(path).startswith(FITS_START)
 
 
-def read_table(path: Path, limits: Limits = LIMITS) -> Table:
+def read_table(path: Path, limits: FileLimits = LIMITS) -> Table:
     """Read the table in a file; the format is determined by its extension.
 
     Supported extensions are .ecsv, .csv, .tsv, .fits (first table extension, or the objects of

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from bayesdist.errors import FormatError
-from bayesdist.files.budget import LIMITS, Budget, Limits
+from bayesdist.files.budget import LIMITS, Budget, FileLimits
 from bayesdist.files.fits import FITS_START
 from bayesdist.files.regular import PIECE, PathLike, decoded, read_bytes
 from bayesdist.utils.memory import size_text
@@ -69,7 +69,7 @@ def _codec(raw: bytes) -> tuple[str, Callable[[bytes], Iterator[bytes]]] | None:
 
 
 def read_unpacked(
-    path: PathLike, limits: Limits = LIMITS, watch: Callable[[bytes], None] | None = None
+    path: PathLike, limits: FileLimits = LIMITS, watch: Callable[[bytes], None] | None = None
 ) -> tuple[bytes, Budget]:
     """Decompressed content of a file, with its limits; for `watch` and errors see `unpacked`."""
     raw = read_bytes(path)
@@ -143,7 +143,7 @@ def _within_limits(
     return b"".join(held if total <= most_held else pieces())
 
 
-def read_lines(path: PathLike, limits: Limits = LIMITS) -> list[str]:
+def read_lines(path: PathLike, limits: FileLimits = LIMITS) -> list[str]:
     """Lines of a text file, decompressed, with line ends and without a byte order mark.
 
     Raises the errors of `read_bytes` and `unpacked`, and FormatError if the text is not UTF-8 or

@@ -8,8 +8,8 @@ from typing import Any, Literal
 from bayesdist.errors import FormatError, InputError
 from bayesdist.products.common.asdf.format import Observatory
 from bayesdist.products.common.asdf.tree import (
-    Detector,
     InstrumentMeta,
+    KnownDetector,
     PlacedSettings,
     ReferenceMeta,
     tree_of,
@@ -49,11 +49,11 @@ _LONG = ("NRCALONG", "NRCBLONG")
 _SIDE = (2048.0, 2048.0)
 # Pixel scales: mean over the FULL apertures in the SIAF (PRDOPSSOC-075).
 _DETECTORS = {
-    "NIRCAM": dict.fromkeys(_SHORT, Detector(_SIDE, 0.0311))
-    | dict.fromkeys(_LONG, Detector(_SIDE, 0.0630)),
-    "NIRISS": {"NIS": Detector(_SIDE, 0.0656)},
-    "FGS": dict.fromkeys(("GUIDER1", "GUIDER2"), Detector(_SIDE, 0.0690)),
-    "MIRI": {"MIRIMAGE": Detector((1032.0, 1024.0), 0.1109)},
+    "NIRCAM": dict.fromkeys(_SHORT, KnownDetector(_SIDE, 0.0311))
+    | dict.fromkeys(_LONG, KnownDetector(_SIDE, 0.0630)),
+    "NIRISS": {"NIS": KnownDetector(_SIDE, 0.0656)},
+    "FGS": dict.fromkeys(("GUIDER1", "GUIDER2"), KnownDetector(_SIDE, 0.0690)),
+    "MIRI": {"MIRIMAGE": KnownDetector((1032.0, 1024.0), 0.1109)},
 }
 # Types of exposures that take direct images.
 EXPOSURE_TYPES = {
@@ -64,7 +64,7 @@ EXPOSURE_TYPES = {
 }
 
 
-def _detector(instrument: Mapping[str, Any]) -> Detector | None:
+def _detector(instrument: Mapping[str, Any]) -> KnownDetector | None:
     name, detector = str(instrument.get("name")), str(instrument.get("detector"))
     return _DETECTORS.get(name, {}).get(detector)
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from bayesdist.errors import FormatError, InputError
 from bayesdist.products.common.asdf.format import Observatory
 from bayesdist.products.common.asdf.tree import (
-    Detector,
+    KnownDetector,
     PlacedSettings,
     ReferenceMeta,
     tagged,
@@ -53,7 +53,7 @@ ELEMENTS = (
 )  # fmt: skip
 DETECTORS = tuple(f"WFI{n:02d}" for n in range(1, 19))
 # mean pixel scale of the FULL apertures, which range from 0.1059 to 0.1093
-_WFI = Detector((4088.0, 4088.0), 0.1075)
+_WFI = KnownDetector((4088.0, 4088.0), 0.1075)
 _REQUIRED = ("reftype", "description", "author", "pedigree", "useafter", "telescope", "origin")
 
 

@@ -25,7 +25,7 @@ from astropy.table import Table
 from bayesdist.data.tables.parquet import describe_part
 from bayesdist.errors import FormatError, InputError
 from bayesdist.files.asdf import asdf_tree
-from bayesdist.files.budget import Budget, Limits
+from bayesdist.files.budget import Budget, FileLimits
 from bayesdist.files.documents import refuse_multiplied_yaml
 from bayesdist.files.fits import open_fits
 from bayesdist.files.hdf5 import hdf5_arrays, netcdf_groups
@@ -35,7 +35,7 @@ from bayesdist.files.unpacked import CODECS, TextCounts, read_unpacked, unpacked
 from bayesdist.products.common.content import Content
 
 N = 2000
-SMALL = Limits(content=10_000, content_per_byte=2, arrays=10_000)
+SMALL = FileLimits(content=10_000, content_per_byte=2, arrays=10_000)
 COMPRESS = {"gzip": gzip.compress, "bzip2": bz2.compress, "xz": lzma.compress}
 WRITTEN_AS = {
     ".ecsv": "ascii.ecsv", ".csv": "ascii.csv", ".tsv": "ascii.tab", ".fits": "fits",
@@ -86,7 +86,7 @@ def test_content_of_any_kind(codec, tmp_path):
 def test_content_that_is_refused_is_not_held(codec):
     raw, size = 8 * COMPRESS[codec](bytes(PIECE)), 8 * PIECE
     for most, fits_in in ((size - 1, False), (size, True)):
-        limits = Limits(content=most, content_per_byte=0, held=PIECE // 2)
+        limits = FileLimits(content=most, content_per_byte=0, held=PIECE // 2)
         tracemalloc.start()
         try:
             if fits_in:
@@ -121,9 +121,9 @@ def test_rows_and_cells_are_counted_over_all_pieces(end):
     text = end.join(f"{k} {k}, {k}\t{k}" for k in range(10)).encode() + end.encode()
     for step in (1, 2, 3, 1000):
         for limits, words in [
-            (Limits(rows=10, rows_per_byte=0, cells=40, cells_per_byte=0), None),
-            (Limits(rows=9, rows_per_byte=0), "holds 10 rows"),
-            (Limits(cells=39, cells_per_byte=0), "holds 40 cells"),
+            (FileLimits(rows=10, rows_per_byte=0, cells=40, cells_per_byte=0), None),
+            (FileLimits(rows=9, rows_per_byte=0), "holds 10 rows"),
+            (FileLimits(cells=39, cells_per_byte=0), "holds 40 cells"),
         ]:
             counts = TextCounts(Budget("a", 100, limits), compressed=True)
             with nullcontext() if words is None else pytest.raises(FormatError, match=words):
@@ -162,7 +162,7 @@ def test_hdf5_of_equal_numbers(codec, tmp_path):
     if codec is not None:
         for read in (hdf5_arrays, netcdf_groups):
             with pytest.raises(FormatError, match="announces 16 kB in a file of"):
-                read(path, limits=Limits(content=10_000, content_per_byte=0))
+                read(path, limits=FileLimits(content=10_000, content_per_byte=0))
 
 
 @pytest.mark.parametrize("codec", ["zlib", "bzp2", "lz4"])
@@ -180,7 +180,7 @@ def test_blocks_of_asdf(codec):
     announced = (8 * N).to_bytes(8)
     assert raw.count(announced) == 2
     less = raw.replace(announced, (80).to_bytes(8))
-    for limits in (Limits(), SMALL):
+    for limits in (FileLimits(), SMALL):
         with pytest.raises(FormatError, match=r"and holds others|announces \d"):
             asdf_tree(less, Budget("a.asdf", len(raw), limits), max_order=12)
 
@@ -236,24 +236,24 @@ def test_long_lines_many_lines_many_cells_and_many_columns(tmp_path):
     path.write_text("# " + 100 * "a" + "\nx,y\n" + 200 * "1,2\n")
     assert len(read_table(path)) == 200
     for limits, words in [
-        (Limits(line=50), "line 1: has 103 characters, but at most 50 are read"),
-        (Limits(rows=100, rows_per_byte=0), "holds 202 rows in a file of"),
-        (Limits(columns=1), "has more than 1 columns"),
+        (FileLimits(line=50), "line 1: has 103 characters, but at most 50 are read"),
+        (FileLimits(rows=100, rows_per_byte=0), "holds 202 rows in a file of"),
+        (FileLimits(columns=1), "has more than 1 columns"),
     ]:
         with pytest.raises(FormatError, match=words):
             read_table(path, limits)
     zipped.write_bytes(gzip.compress(path.read_bytes()))
     with pytest.raises(FormatError, match="holds 404 cells"):
-        read_table(zipped, Limits(cells=100, cells_per_byte=0))
+        read_table(zipped, FileLimits(cells=100, cells_per_byte=0))
     with pytest.raises(FormatError, match="takes more than"):
-        read_table(zipped, Limits(seconds=0, seconds_per_byte=0))
+        read_table(zipped, FileLimits(seconds=0, seconds_per_byte=0))
 
 
 def test_long_comments_take_no_time(tmp_path):
     """astropy's reader takes the square of their length."""
     path = tmp_path / "a.csv"
     path.write_text(20 * ("# " + 60_000 * "a" + "\n") + "x,y\n1,2\n")
-    assert len(read_table(path, Limits(seconds=1))) == 1
+    assert len(read_table(path, FileLimits(seconds=1))) == 1
 
 
 # -- trees ----------------------------------------------------------------------------------------
@@ -266,12 +266,12 @@ LAUGHS = "\n".join(
 @pytest.mark.parametrize(
     ("text", "limits", "words"),
     [
-        (LAUGHS, Limits(nodes=100), "has more than 100 nodes in its YAML, with aliases"),
-        ("a: &a [1, *a]", Limits(), "YAML that refers to itself"),
-        ("[" * 20 + "]" * 20, Limits(depth=10), "more than 10 brackets within each other"),
-        ("a: " + 200 * "x", Limits(header=100), "more than 100 characters in its header"),
-        ("a: [1", Limits(), "is not YAML that can be read"),
-        (LAUGHS, Limits(seconds=0, seconds_per_byte=0), "takes more than"),
+        (LAUGHS, FileLimits(nodes=100), "has more than 100 nodes in its YAML, with aliases"),
+        ("a: &a [1, *a]", FileLimits(), "YAML that refers to itself"),
+        ("[" * 20 + "]" * 20, FileLimits(depth=10), "more than 10 brackets within each other"),
+        ("a: " + 200 * "x", FileLimits(header=100), "more than 100 characters in its header"),
+        ("a: [1", FileLimits(), "is not YAML that can be read"),
+        (LAUGHS, FileLimits(seconds=0, seconds_per_byte=0), "takes more than"),
     ],
 )
 def test_trees_of_yaml(text, limits, words):
@@ -284,7 +284,7 @@ def test_aliases_of_a_plausible_size_pass():
 
 
 def test_aliases_in_every_header(tmp_path):
-    table, limits = Table({"x": [1.0, 2.0], "y": [3.0, 4.0]}), Limits(nodes=100)
+    table, limits = Table({"x": [1.0, 2.0], "y": [3.0, 4.0]}), FileLimits(nodes=100)
     ecsv, other, parquet = (tmp_path / n for n in ("a.ecsv", "b.tbl", "a.parquet"))
     table.write(ecsv)
     lines = ecsv.read_text().splitlines()
@@ -307,7 +307,7 @@ def test_aliases_in_asdf():
     raw += LAUGHS.encode() + b"\n...\n"
     assert set(asdf_tree(raw, Budget("a", len(raw)), max_order=12)) >= {"a0", "a1", "a2"}
     with pytest.raises(FormatError, match="with aliases"):
-        asdf_tree(raw, Budget("a", len(raw), Limits(nodes=100)), max_order=12)
+        asdf_tree(raw, Budget("a", len(raw), FileLimits(nodes=100)), max_order=12)
 
 
 ARRAY = "!<tag:stsci.edu:asdf/core/ndarray-1.1.0> {{source: {}, shape: {}, datatype: float64{}}}"
@@ -382,9 +382,9 @@ def test_groups_that_hold_themselves_and_many_links(tmp_path):
         group["x"] = np.arange(3)
     assert list(netcdf_groups(tmp_path / "a.h5")["a"].arrays["x"]) == [0, 1, 2]
     with pytest.raises(FormatError, match="has more than 2 groups and arrays"):
-        netcdf_groups(tmp_path / "a.h5", Limits(nodes=2))
+        netcdf_groups(tmp_path / "a.h5", FileLimits(nodes=2))
     with pytest.raises(FormatError, match="takes more than"):
-        netcdf_groups(tmp_path / "a.h5", Limits(seconds=0, seconds_per_byte=0))
+        netcdf_groups(tmp_path / "a.h5", FileLimits(seconds=0, seconds_per_byte=0))
     with h5py.File(tmp_path / "b.h5", "w") as file:  # one chunk, which is read whole
         file.create_dataset("x", (1,), "f4", chunks=(2**26,), maxshape=(None,))
     with pytest.raises(FormatError, match="announces 268 MB"):
@@ -400,7 +400,7 @@ def test_one_long_text_in_all_rows(tmp_path):
     pq.write_table(pa.table({"x": np.arange(n), "name": texts}), path)
     with pytest.raises(FormatError, match="announces 36 MB in a file of"):
         read_table(path)
-    assert len(read_table(path, Limits(content=2**27))) == n
+    assert len(read_table(path, FileLimits(content=2**27))) == n
 
 
 @pytest.mark.parametrize("kind", ["record", "list", "fixed"])
@@ -465,10 +465,10 @@ def test_headers_of_pages(text, version, tmp_path):
     metadata = pq.read_metadata(path)
     groups = map(metadata.row_group, range(metadata.num_row_groups))
     stated = sum(g.column(k).total_uncompressed_size for g in groups for k in range(2))
-    largest = Limits(content=2**28)
+    largest = FileLimits(content=2**28)
     assert len(read_table(path, largest)) == 1000
     with pytest.raises(FormatError, match="announces"):
-        read_table(path, Limits(content=stated - 1, content_per_byte=0))
+        read_table(path, FileLimits(content=stated - 1, content_per_byte=0))
 
 
 def test_rows_columns_and_lists_of_parquet(tmp_path):
@@ -476,10 +476,10 @@ def test_rows_columns_and_lists_of_parquet(tmp_path):
     lists = pa.array([[0] * 1000] * 10)
     pq.write_table(pa.table({"x": np.zeros(10), "y": lists}), path)
     for limits, words in [
-        (Limits(rows=5, rows_per_byte=0), "announces 10 rows"),
-        (Limits(columns=1), "has more than 1 columns"),
-        (Limits(cells=5000, cells_per_byte=0), r"holds 1e\+04 cells"),
-        (Limits(seconds=0, seconds_per_byte=0), "takes more than"),
+        (FileLimits(rows=5, rows_per_byte=0), "announces 10 rows"),
+        (FileLimits(columns=1), "has more than 1 columns"),
+        (FileLimits(cells=5000, cells_per_byte=0), r"holds 1e\+04 cells"),
+        (FileLimits(seconds=0, seconds_per_byte=0), "takes more than"),
     ]:
         with pytest.raises(FormatError, match=words):
             read_table(path, limits)
@@ -495,9 +495,9 @@ def test_parts_and_cards_of_fits():
     many = _fits(*(fits.ImageHDU() for _ in range(5)))
     cards = fits.ImageHDU(header=fits.Header([(f"A{k}", k) for k in range(50)]))
     for raw, limits, words in [
-        (many, Limits(parts=3), "has more than 3 HDUs"),
-        (_fits(cards), Limits(nodes=40), "has more than 40 header cards"),
-        (many, Limits(seconds=0, seconds_per_byte=0), "takes more than"),
+        (many, FileLimits(parts=3), "has more than 3 HDUs"),
+        (_fits(cards), FileLimits(nodes=40), "has more than 40 header cards"),
+        (many, FileLimits(seconds=0, seconds_per_byte=0), "takes more than"),
     ]:
         budget = Budget("a.fits", len(raw))
         assert len(open_fits(raw, budget)) > 1
@@ -553,7 +553,7 @@ def test_arrays_of_fits_that_share_one_place(tmp_path):
         raw[first + 8 * k : first + 8 * k + 8] = raw[first : first + 8]
     (tmp_path / "a.fits").write_bytes(raw)
     with pytest.raises(FormatError, match="announces 8 MB"):
-        read_table(tmp_path / "a.fits", Limits(content=10**6))
+        read_table(tmp_path / "a.fits", FileLimits(content=10**6))
     # read as a product, whose budget is not given
     assert len(Content("a.fits", bytes(raw)).hdus[1].rows) == 1000
     for k in range(1000):
@@ -605,12 +605,12 @@ def test_sizes_of_a_votable(tmp_path):
         _votable(path, binary=binary)
         assert len(read_table(path)) == 50
         for limits, words in [
-            (Limits(rows=40, **none), r"holds \d+ rows"),
-            (Limits(cells=80, **none), "cells in a file of"),
-            (Limits(columns=1), "has more than 1 columns"),
-            (Limits(depth=2), "has more than 2 elements within each other"),
-            (Limits(nodes=3), "has more than 3 elements"),
-            (Limits(seconds=0, seconds_per_byte=0), "takes more than"),
+            (FileLimits(rows=40, **none), r"holds \d+ rows"),
+            (FileLimits(cells=80, **none), "cells in a file of"),
+            (FileLimits(columns=1), "has more than 1 columns"),
+            (FileLimits(depth=2), "has more than 2 elements within each other"),
+            (FileLimits(nodes=3), "has more than 3 elements"),
+            (FileLimits(seconds=0, seconds_per_byte=0), "takes more than"),
         ]:
             with pytest.raises(FormatError, match=words):
                 read_table(path, limits)
@@ -645,7 +645,7 @@ def test_arrays_of_many_that_share_a_dimension(tmp_path):
         file.dimensions = {"star": 50}
         for k in range(40):
             file.create_variable(f"v{k}", ("star",), float)[:] = k
-    limits = Limits(content=500_000, content_per_byte=0)
+    limits = FileLimits(content=500_000, content_per_byte=0)
     assert path.stat().st_size * 40 > limits.content
     assert netcdf_groups(path, limits=limits)
 

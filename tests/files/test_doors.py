@@ -18,7 +18,7 @@ from astropy.table import Table
 
 from bayesdist.errors import FormatError, InputError
 from bayesdist.files import regular
-from bayesdist.files.budget import Budget, Limits
+from bayesdist.files.budget import Budget, FileLimits
 from bayesdist.files.documents import DEEPEST, json_of, toml_of
 from bayesdist.files.fits import open_fits
 from bayesdist.files.hdf5 import hdf5_arrays, netcdf_groups
@@ -127,7 +127,7 @@ def test_a_table_of_rows_that_are_not_there(tmp_path):
 def test_columns_that_are_a_million_times_their_file(tmp_path):
     pq.write_table(pa.table({"x": np.zeros(100_000)}), tmp_path / "a.parquet")
     with pytest.raises(FormatError, match="announces 800 kB in a file of"):
-        read_table(tmp_path / "a.parquet", Limits(content=10_000))
+        read_table(tmp_path / "a.parquet", FileLimits(content=10_000))
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file.create_dataset("x", (10**12,), np.float64, chunks=(1000,))
     for read in (hdf5_arrays, netcdf_groups):

@@ -10,7 +10,7 @@ from bayesdist.assess.comparison.compare import Comparison, compare
 from bayesdist.calibration.chip_map import ChipMap
 from bayesdist.diagnose.residuals.misfit import Misfit
 from bayesdist.infer.compare.change_date import ChangeDate
-from bayesdist.infer.compare.monitoring import Change
+from bayesdist.infer.compare.monitoring import SolutionChange
 from bayesdist.utils.checks import DIFFERENCE
 from bayesdist.utils.distributions import f_sf
 from bayesdist.utils.text import p_words
@@ -20,7 +20,7 @@ from bayesdist.utils.text import p_words
 class Monitored:
     """Change of a released solution as measured from new matches."""
 
-    change: Change
+    change: SolutionChange
     # new minus released, one per chip, in pixels: the mean change, or the change since `date`
     maps: tuple[Comparison, ...]
     date: ChangeDate | None  # None for matches without epochs
@@ -136,7 +136,7 @@ class Monitored:
         return out
 
 
-def is_late(change: Change, date: ChangeDate | None) -> bool:
+def is_late(change: SolutionChange, date: ChangeDate | None) -> bool:
     """True if a change within the new matches is significant, and more so than the mean change.
 
     `date` is the most likely date of a change within the new matches, if it was searched for.
@@ -147,7 +147,7 @@ def is_late(change: Change, date: ChangeDate | None) -> bool:
 
 
 def change_maps(
-    change: Change,
+    change: SolutionChange,
     *,
     rng: np.random.Generator,
     names: tuple[str, str],

@@ -36,7 +36,7 @@ from bayesdist.diagnose.correlated.priors import DiscrepancyPriors, log_half_t
 from bayesdist.diagnose.correlated.result import ChipStructure, Discrepancy, structure_correlation
 from bayesdist.diagnose.correlated.structure import Structure, structure_posterior
 from bayesdist.diagnose.statistics import EfficientScore
-from bayesdist.infer.catalogue.star_errors import StarSums, influence_by_group
+from bayesdist.infer.catalogue.star_errors import MatchesByStar, influence_by_group
 from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.exposures.hierarchy import Settling
@@ -354,7 +354,7 @@ class SharedStars:
         D = model.n_distortion  # frames change according to their correlation with these
         uu, uv, vv = self.curvature
         unit_weights = np.ones(len(self.code))
-        sums = StarSums.of(self.stars, self.code, np.stack([uu, vv]), [unit_weights], uv)
+        sums = MatchesByStar.of(self.stars, self.code, np.stack([uu, vv]), [unit_weights], uv)
         gradient = influence_by_group(model, theta, self.stars.groups, None, D)
         alike = [np.ones((int(self.code.max()) + 1, 2))]
         shared = sums.shared(gradient, alike)[0] - sums.independent(gradient, alike)

@@ -273,7 +273,7 @@ def one_per_chip(tables: Sequence[LookupTable], where: str) -> list[LookupTable]
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class ChipTables:
     """Tables of one chip; the reading program applies `turn` (2, 2) before it takes maxima."""
 
     table: LookupTable  # defines chip and grid
@@ -297,7 +297,7 @@ class Part:
 
 
 def lookup_file(
-    parts: Sequence[Part], *, size: tuple[int, int], cards: Sequence[str], name: str
+    parts: Sequence[ChipTables], *, size: tuple[int, int], cards: Sequence[str], name: str
 ) -> LookupFile:
     """File of all parts, in the order of EXTVER.
 

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from bayesdist.errors import DegenerateError, FormatError, InputError
 from bayesdist.formats.lookup.file import (
+    ChipTables,
     LookupFile,
-    Part,
     check_kind,
     lookup_file,
     one_per_chip,
@@ -98,7 +98,7 @@ def write_d2im(
             )
     chips, kind = one_per_chip(tables, location), f"{detector} D2I FILE"
     file = lookup_file(
-        [Part(t, t.values, t.sigma) for t in chips],
+        [ChipTables(t, t.values, t.sigma) for t in chips],
         size=size,
         cards=reference_cards(
             instrument, detector, kind, description, {}, useafter, pedigree, history
@@ -407,14 +407,14 @@ class _Local:
     def _at_nodes(self, table: LookupTable) -> Float:
         return self.jacobian(*np.meshgrid(*table.nodes()))
 
-    def part(self, table: LookupTable) -> Part:
+    def part(self, table: LookupTable) -> ChipTables:
         """Convert a table before the polynomial to the stored form, after it."""
         jacobian = self._at_nodes(table)
         values = np.einsum("yxab,byx->ayx", jacobian, table.values)
         sigma = None
         if table.sigma is not None:
             sigma = np.sqrt(np.einsum("yxab,byx->ayx", jacobian**2, table.sigma**2))
-        return Part(table, values, sigma, np.linalg.inv(self.linear))
+        return ChipTables(table, values, sigma, np.linalg.inv(self.linear))
 
     def before(self, stored: LookupTable) -> LookupTable:
         """Convert a stored table, after the polynomial, to one before it."""

@@ -23,7 +23,7 @@ from bayesdist.formats.siaf.table import (
     KEYWORDS,
     NAMES,
     SIDE,
-    Row,
+    SiafRow,
     SiafTable,
     departure,
     holds_table,
@@ -345,9 +345,9 @@ def _shift(table: SiafTable, closure: float) -> Iterator[Finding]:
         )  # fmt: skip
 
 
-def _exchanged(table: SiafTable, columns: tuple[int, int]) -> Iterator[Row]:
+def _exchanged(table: SiafTable, columns: tuple[int, int]) -> Iterator[SiafRow]:
     """Rows with the powers of x and y exchanged in two columns, for terms above the linear ones."""
-    by: Mapping[tuple[int, int], Row] = {row.powers: row for row in table.rows}
+    by: Mapping[tuple[int, int], SiafRow] = {row.powers: row for row in table.rows}
     for row in table.rows:
         mirror_row = by.get(row.powers[::-1])
         if mirror_row is None or sum(row.powers) < 2:

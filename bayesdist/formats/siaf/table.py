@@ -56,7 +56,7 @@ _FULL_FRAMES = {
 
 
 @dataclass(frozen=True)
-class Row:
+class SiafRow:
     """Row of a table."""
 
     line: int
@@ -71,7 +71,7 @@ class SiafTable:
 
     name: str
     aperture: str
-    rows: tuple[Row, ...]
+    rows: tuple[SiafRow, ...]
     stated: Mapping[str, float]  # values of KEYWORDS
     record: Mapping[str, Any] | None = None  # see `common.record`
     names_side_file: bool = False
@@ -235,14 +235,14 @@ def table_of(content: Content) -> SiafTable:
     return replace(table, record=record_beside(content.name), names_side_file=named)
 
 
-def _row(cells: Mapping[str, str], number: int, where: str) -> Row:
+def _row(cells: Mapping[str, str], number: int, where: str) -> SiafRow:
     i, j = (_number(cells[key], where) for key in COLUMNS[2:4])
     values = [_number(cells[key], where) for key in NAMES]
     if not (i.is_integer() and j.is_integer() and i >= 0 and j >= 0 and i + j <= HIGHEST):
         raise FormatError(
             f"the powers are {i:g} and {j:g}", where=where, do=f"give 0 to {HIGHEST} in all"
         )
-    return Row(
+    return SiafRow(
         number,
         cells["siaf_index"].zfill(2),
         (int(i), int(j)),

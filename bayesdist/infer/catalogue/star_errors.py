@@ -298,7 +298,7 @@ def star_covariance(
     _require_contained(matches, code, errors)
     stars, order = prepare(solution.model, matches)
     used = solution.uses(matches)[order]
-    sums = StarSums.weighted(stars, code[order], list(levers[..., order]), used.astype(float))
+    sums = MatchesByStar.weighted(stars, code[order], list(levers[..., order]), used.astype(float))
     cov, mean = np.asarray(solution.cov, float), np.asarray(solution.mean)
     D = solution.model.n_params if frames else solution.model.n_distortion
     influence = influence_by_group(solution.model, mean, stars.groups, cov, D)
@@ -431,7 +431,7 @@ def star_influence(
     star = code[wanted][order]
     epoch = None if matches.epoch is None else matches.epoch[wanted][order]
     levers = list(errors.levers(star, epoch))
-    sums = StarSums.weighted(stars, np.searchsorted(codes, star), levers)
+    sums = MatchesByStar.weighted(stars, np.searchsorted(codes, star), levers)
     influence = influence_by_group(model, fit.mean, stars.groups, fit.cov, D)
     by[: len(levers)] = sums.each(influence, 0, len(codes))
     return StarInfluence(errors, codes, by)
@@ -467,7 +467,7 @@ def _summed(sums: Float, covariances: Float) -> Float:
 
 
 @dataclass(frozen=True, eq=False)
-class StarSums:
+class MatchesByStar:
     """Matches sorted by group, and by star within each group."""
 
     starts: Int  # first match (G + 1,) of each group
@@ -488,7 +488,7 @@ class StarSums:
         weight: Float,
         levers: list[Float],
         cross: Float | None = None,
-    ) -> StarSums:
+    ) -> MatchesByStar:
         """Sort matches by group and star.
 
         The matches are in the order of `stars`.  `code` (N,) are their star codes; see the class
@@ -518,7 +518,7 @@ class StarSums:
     @classmethod
     def weighted(
         cls, stars: Stars, code: Int, levers: list[Float], used: Float | float = 1.0
-    ) -> StarSums:
+    ) -> MatchesByStar:
         """Sums with weights `used` (N,) times the inverse covariances of the matches."""
         if not stars.is_correlated:
             return cls.of(stars, code, np.stack([used / stars.var_u, used / stars.var_v]), levers)

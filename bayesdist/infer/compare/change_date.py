@@ -17,7 +17,7 @@ import numpy as np
 from scipy.linalg import null_space
 
 from bayesdist.data.matches import Matches
-from bayesdist.infer.compare.monitoring import Change, NewFit
+from bayesdist.infer.compare.monitoring import NewFit, SolutionChange
 from bayesdist.infer.equations.normal import NormalEquations, mixture
 from bayesdist.infer.equations.scaled import FieldTest, determined
 from bayesdist.infer.kernel import Constants
@@ -59,7 +59,7 @@ class ChangeDate:
     gain: Float  # decrease (P,) of chi-square for a change that starts with period k
     dof: int  # degrees of freedom of the best change
     p_value: float  # chance probability of the largest gain, times the number of dates tried
-    change: Change  # change after the best date, instead of that of all matches
+    change: SolutionChange  # change after the best date, instead of that of all matches
     # chi-square per degree of freedom of the periods about the best change; about 1 if errors are
     # correct and independent (slightly less, since the date was optimised)
     scatter: float
@@ -67,7 +67,7 @@ class ChangeDate:
     p_scatter: float  # probability of a larger scatter
 
 
-def period_scores(new: NewFit, change: Change, matches: Matches) -> tuple[PeriodScore, ...]:
+def period_scores(new: NewFit, change: SolutionChange, matches: Matches) -> tuple[PeriodScore, ...]:
     """Scores of all periods in chronological order, from one pass over the data in chunks.
 
     `matches` are those of `new`, with epochs.  With at most `MOST_PERIODS` dates, each date is a
@@ -113,7 +113,7 @@ def _joined(
     return a[0] + b[0], min(a[1], b[1]), max(a[2], b[2]), a[3] + b[3]
 
 
-def _score(new: NewFit, change: Change, equations: NormalEquations) -> tuple[Float, Float]:
+def _score(new: NewFit, change: SolutionChange, equations: NormalEquations) -> tuple[Float, Float]:
     """Normal matrix and score of the polynomials about the release, with frames eliminated."""
     codes = np.unique(equations.groups.exposure)
     model = _of_exposures(new.model, codes)
@@ -158,7 +158,7 @@ def _of_exposures(model: DistortionModel, codes: Int) -> DistortionModel:
     return replace(model, exposures=("(release)", *names))
 
 
-def scan_dates(scores: tuple[PeriodScore, ...], change: Change) -> ChangeDate:
+def scan_dates(scores: tuple[PeriodScore, ...], change: SolutionChange) -> ChangeDate:
     """Find the most likely date of a change, its interval, and the scatter of the periods.
 
     `scores` has the scores of the periods in chronological order.  `change` provides the covariance
@@ -218,7 +218,9 @@ def _root(normal: Float, free: Float) -> Float:
     return np.asarray(free @ determined((inside + inside.T) / 2))
 
 
-def _from_then_on(change: Change, normal: Float, right: Float, free: Float) -> Change:
+def _from_then_on(
+    change: SolutionChange, normal: Float, right: Float, free: Float
+) -> SolutionChange:
     """Best-fitting change for a normal matrix and score, without the fields that frames absorb."""
     root = without(change.absorbed, mean_squares(change.model)) @ _root(normal, free)
     white = right @ _root(normal, free)

@@ -108,7 +108,7 @@ class NewFit:
 
 
 @dataclass(frozen=True, eq=False)
-class Change:
+class SolutionChange:
     """Difference between the polynomials of the new matches and the released ones.
 
     Parameters
@@ -262,7 +262,7 @@ def new_model(released: DistortionModel, matches: Matches) -> DistortionModel:
     )
 
 
-def change_of(new: NewFit, *, draws: float = np.inf) -> Change:
+def change_of(new: NewFit, *, draws: float = np.inf) -> SolutionChange:
     """Difference between the polynomials of the new matches and the release, with its test.
 
     Parameters
@@ -275,7 +275,7 @@ def change_of(new: NewFit, *, draws: float = np.inf) -> Change:
 
     Returns
     -------
-    Change
+    SolutionChange
     """
     released, model = new.released, new.released.model
     n, K, C = model.n_polynomial, model.n_terms, len(model.chips)
@@ -309,7 +309,7 @@ def change_of(new: NewFit, *, draws: float = np.inf) -> Change:
     of_release = np.einsum("ij,jk,ik->i", projector, released_cov, projector)
     varying = variance > 1e-16 * np.diag(cov)
     fraction = max(float(np.mean(of_release[varying] / variance[varying])), 1e-3)
-    return Change(
+    return SolutionChange(
         model=model,
         epoch=new.epoch,
         released=old,

@@ -226,7 +226,7 @@ def _proposal(
 
 
 @dataclass(frozen=True)
-class Prediction:
+class SamplingPrediction:
     """Predicted moves and number of passes of a run.
 
     Parameters
@@ -247,7 +247,7 @@ class Prediction:
     most_passes: int
 
 
-def predict(target: Density, proposal: Proposal, settings: ChainSettings) -> Prediction:
+def predict(target: Density, proposal: Proposal, settings: ChainSettings) -> SamplingPrediction:
     """Predict the cost of a run with these settings; no files are written.
 
     The pilot is that of the run, which will therefore start with the same moves.  Passes can be
@@ -262,7 +262,7 @@ def predict(target: Density, proposal: Proposal, settings: ChainSettings) -> Pre
     if plan.independent and sure:
         passes = expected_passes(len(target.names), s.n_stars, s.limits, ensembles)
     most_passes = ensembles * plan.walkers * s.max_steps
-    return Prediction(plan, quality, passes, most_passes)
+    return SamplingPrediction(plan, quality, passes, most_passes)
 
 
 @one_thread
@@ -277,7 +277,7 @@ def predict_sampling(
     walkers: int | None,
     limits: Limits,
     max_steps: int,
-) -> Prediction:
+) -> SamplingPrediction:
     """Predict the cost of `sample` with the same arguments.
 
     Raises DegenerateError if no posterior mode is found, like `sample`.

@@ -225,7 +225,7 @@ class TransformedSolution(DerivedSolution):
 
 
 @dataclass(frozen=True, eq=False)
-class LinearMap:
+class ParameterMap:
     """Linear map of the first n of the parameters (..., D) by a matrix (m, n); can be pickled."""
 
     matrix: Float

@@ -20,7 +20,7 @@ from bayesdist.calibration.modeling import forward_transform, inverse_transform
 from bayesdist.calibration.plane import Plane
 from bayesdist.errors import FormatError, InputError, required
 from bayesdist.model.basis import MAX_ORDER
-from bayesdist.products.common.asdf.tree import Detector, PlacedSettings
+from bayesdist.products.common.asdf.tree import KnownDetector, PlacedSettings
 from bayesdist.products.common.coefficients import require_regular
 from bayesdist.products.common.document import (
     BuildOptions,
@@ -47,7 +47,7 @@ class DistortionFile:
     meta: Mapping[str, Any]
     units: tuple[str, str]  # of input and output, as stated; empty if not stated
     record: Mapping[str, Any] | None = None  # record written by bayesdist, see `common.record`
-    detector: Detector | None = None  # None if unknown
+    detector: KnownDetector | None = None  # None if unknown
 
     @property
     def inverse(self) -> Model | None:
@@ -366,7 +366,7 @@ def chip_transforms(
         yield ChipTransform(dated, number, nominal.name, model, record, closure)
 
 
-def refuse_larger(one: ChipTransform, name: str, known: Detector | None, where: str) -> None:
+def refuse_larger(one: ChipTransform, name: str, known: KnownDetector | None, where: str) -> None:
     """Raise InputError if a chip has more pixels than the detector of this name, if it is known."""
     [chip] = one.calibration.model.chips
     if known is not None and any(a > b for a, b in zip(chip.size, known.size, strict=True)):

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.products.common.asdf.tree import (
-    Detector,
+    KnownDetector,
     PlacedSettings,
     ReferenceMeta,
     is_asdf,
@@ -44,7 +44,7 @@ class Observatory(Generic[Settings]):
     # returns the node with meta and transform, and the key of the transform; None for a file of
     # another format, FormatError if these nodes are missing
     node: Callable[[Content], tuple[Mapping[str, Any], str] | None]
-    detector: Callable[[Mapping[str, Any]], Detector | None]  # takes the node meta.instrument
+    detector: Callable[[Mapping[str, Any]], KnownDetector | None]  # takes the node meta.instrument
     lint_meta: Callable[[Mapping[str, Any]], Iterable[Finding]]  # takes the node meta
     # (detector name, settings) -> node meta; InputError for unknown values
     meta: Callable[[str, Settings], ReferenceMeta]

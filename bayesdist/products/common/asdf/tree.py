@@ -87,7 +87,7 @@ class PlacedSettings(FormatSettings):
 
 
 @dataclass(frozen=True)
-class Detector:
+class KnownDetector:
     """Known properties of a detector."""
 
     size: tuple[float, float]
