@@ -10,8 +10,7 @@ from bayesdist.infer import OutlierMixture
 from bayesdist.infer.density.laplace import Node, Split
 from bayesdist.infer.density.proposal import GridProposal
 from bayesdist.infer.equations.arrow import Arrow
-from bayesdist.infer.sampler.ensembles import Ensembles
-from bayesdist.infer.sampler.proposals import ProposalBatch, Walkers, Whitening
+from bayesdist.infer.sampler.ensembles import Ensembles, ProposalBatch, Walkers, Whitening
 from bayesdist.infer.sampler.schedule import Plan, StepRange
 
 

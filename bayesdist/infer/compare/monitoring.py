@@ -34,7 +34,7 @@ from bayesdist.model import DistortionModel
 from bayesdist.model.alignment import frame_between, frame_fields, mean_squares, without
 from bayesdist.utils.arrays import Float
 
-__all__ = ["Change", "NewFit", "change_of", "fit_new", "new_model", "with_star_errors_of"]
+__all__ = ["NewFit", "SolutionChange", "change_of", "fit_new", "new_model", "with_star_errors_of"]
 
 SAMPLE = 1_000_000  # number of matches used to compute the mean date
 HELD = 1e-4  # prior sigma of a fixed rate, in units of its released sigma

@@ -12,7 +12,6 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -31,7 +30,14 @@ from bayesdist.infer.density.proposal import (
 )
 from bayesdist.infer.density.target import Density
 from bayesdist.infer.posterior import SamplerInfo
-from bayesdist.infer.sampler.proposals import Block, ProposalBatch, Walkers, Whitening, pilot_batch
+from bayesdist.infer.sampler.ensembles import (
+    Block,
+    Ensembles,
+    ProposalBatch,
+    Walkers,
+    Whitening,
+    pilot_batch,
+)
 from bayesdist.infer.sampler.schedule import (
     EFFICIENT,
     JUDGED_AFTER,
@@ -51,9 +57,6 @@ from bayesdist.infer.sampler.schedule import (
 )
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.checks import PARETO_K
-
-if TYPE_CHECKING:
-    from bayesdist.infer.sampler.ensembles import Ensembles
 
 log = logging.getLogger("bayesdist")
 LEAST_ROWS = 10  # minimum number of stored steps for convergence diagnostics
@@ -186,8 +189,6 @@ def run_chains(density: Density, proposal: Proposal, settings: ChainSettings) ->
     Raises DegenerateError if hardly any proposal is inside the support, and InputError if
     checkpoints cannot be read or written.
     """
-    from bayesdist.infer.sampler.ensembles import Ensembles  # emcee takes a second to import
-
     s, E = settings, len(settings.seeds)
     target = Heartbeat(density, s.n_stars)
     pilot = pilot_of(target, proposal, s)

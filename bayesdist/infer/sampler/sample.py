@@ -28,7 +28,7 @@ from bayesdist.infer.sampler.chains import (
     plan_of,
     run_chains,
 )
-from bayesdist.infer.sampler.proposals import CHECKPOINT
+from bayesdist.infer.sampler.ensembles import CHECKPOINT
 from bayesdist.infer.sampler.schedule import Plan, expected_passes
 from bayesdist.infer.solution.linear import LinearFit
 from bayesdist.infer.stars.likelihood import OutlierMixture

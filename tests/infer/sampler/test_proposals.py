@@ -17,8 +17,7 @@ from bayesdist.infer.density.proposal import (
     warmup_steps,
 )
 from bayesdist.infer.sampler.chains import ChainSettings, run_chains
-from bayesdist.infer.sampler.ensembles import replay
-from bayesdist.infer.sampler.proposals import ProposalBatch, Walkers, draw_batch
+from bayesdist.infer.sampler.ensembles import ProposalBatch, Walkers, draw_batch, replay
 from bayesdist.infer.sampler.schedule import expected_passes
 from tests.reduced import case_in_full, only_in_full
 

@@ -16,7 +16,7 @@ from scipy import stats
 from bayesdist.infer import Limits, OutlierMixture
 from bayesdist.infer.density.grid import build_proposal
 from bayesdist.infer.density.proposal import GridProposal
-from bayesdist.infer.sampler.proposals import Whitening
+from bayesdist.infer.sampler.ensembles import Whitening
 from bayesdist.infer.sampler.schedule import (
     block_schedule,
     doubling_schedule,
