@@ -59,11 +59,41 @@ def start_logging(*, quiet: bool) -> None:
     for handler in list(log.handlers):
         log.removeHandler(handler)
     handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(logging.Formatter("%(message)s"))
+    handler.setFormatter(_Plain("%(message)s"))
+    handler.addFilter(_Once())
     handler.setLevel(logging.WARNING if quiet else logging.INFO)
     log.addHandler(handler)
     for name in DASK_LOGS:
         logging.getLogger(name).addFilter(_nothing)
+
+
+class _Plain(logging.Formatter):
+    """Messages, of which warnings say that they are."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Text of a record."""
+        text = super().format(record)
+        if record.levelno != logging.WARNING or record.levelname in text:
+            return text
+        return f"{record.levelname}: {text}"
+
+
+class _Once(logging.Filter):
+    """Filter that rejects repeated warnings, as of a file that a command reads several times."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._seen: set[str] = set()
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """True unless the record is a warning that was passed before."""
+        if record.levelno < logging.WARNING:
+            return True
+        text = record.getMessage()
+        if text in self._seen:
+            return False
+        self._seen.add(text)
+        return True
 
 
 def _nothing(_: logging.LogRecord) -> bool:
@@ -96,6 +126,7 @@ def log_file(path: Path) -> Iterator[None]:
             do="check its permissions",
         ) from error
     handler.setFormatter(logging.Formatter(FORMAT))
+    handler.addFilter(_Once())
     log.addHandler(handler)
     try:
         yield

@@ -35,6 +35,7 @@ from bayesdist.data.tables.checks import (
 from bayesdist.data.tables.column import Quantities, SourceColumn, check_unit
 from bayesdist.data.tables.names import ALIASES, find_columns
 from bayesdist.errors import InputError
+from bayesdist.files.fits import MISSING_EXTENSIONS
 from bayesdist.files.tables import read_table
 from bayesdist.utils.arrays import Bool, Float, Int
 from bayesdist.utils.quantities import Direction, Epoch, Number, direction_in, year_of
@@ -540,7 +541,9 @@ def catalog_from_table(
         base = position_unit((u, v), unit)
     n_rows = len(table)
     stars = _usable(table, column_names, source, base=base, motion_prior=motion_prior)
-    table, rows, notes = stars.table, stars.rows, stars.notes
+    cut = table.meta.get(MISSING_EXTENSIONS)
+    notes = (*((f"{source}: {cut}",) if cut else ()), *stars.notes)
+    table, rows = stars.table, stars.rows
     quantities = Quantities(table, column_names, source, lambda index: row_number(int(rows[index])))
     column = quantities.__getitem__
 

@@ -95,24 +95,28 @@ def refuse_rest(raw: bytes, end: int, budget: Budget) -> None:
         )
 
 
-def warn_of_missing_extensions(header: fits.Header, n: int, where: str) -> None:
+MISSING_EXTENSIONS = "missing extensions"  # key of the warning in the header of a table
+
+
+def warn_of_missing_extensions(header: fits.Header, n: int, where: str) -> str:
     """Log a warning if a FITS file has fewer extensions than its primary header states.
 
     A file that was cut exactly between two HDUs is valid. `header` is that of the primary HDU, with
-    the number of extensions in NEXTEND as in files of the HST; `n` extensions follow.
+    the number of extensions in NEXTEND as in files of the HST; `n` extensions follow. Returns the
+    warning as a clause without the name of the file, or an empty string.
     """
     try:
         stated = header.get("NEXTEND", 0)
     except (ValueError, fits.VerifyError):
-        return  # the card has no value
-    if isinstance(stated, int) and stated > n:
-        log.warning(
-            "%s: its primary header states %d extensions (NEXTEND), and the file has %d: the "
-            "others are missing, or the file is truncated",
-            where,
-            stated,
-            n,
-        )
+        return ""  # the card has no value
+    if not isinstance(stated, int) or stated <= n:
+        return ""
+    clause = (
+        f"its primary header states {stated} extensions (NEXTEND), and the file has {n}: the "
+        "others are missing, or the file is truncated"
+    )
+    log.warning("%s: %s", where, clause)
+    return clause
 
 
 def refuse_many_rows(header: fits.Header, budget: Budget) -> None:

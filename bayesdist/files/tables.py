@@ -32,6 +32,7 @@ from bayesdist.files.faults import naming_faults
 from bayesdist.files.fits import (
     FITS_START,
     LDAC_IMAGE,
+    MISSING_EXTENSIONS,
     ldac_image_header,
     open_fits,
     refuse_long_arrays,
@@ -196,7 +197,7 @@ def _says_number(cell: str) -> bool:
 def _read_fits(path: Path, limits: FileLimits) -> Table:
     raw, budget = read_unpacked(path, limits)
     with open_fits(raw, budget) as hdus:
-        warn_of_missing_extensions(hdus[0].header, len(hdus) - 1, str(path))
+        warning = warn_of_missing_extensions(hdus[0].header, len(hdus) - 1, str(path))
         tables = [
             hdu
             for hdu in hdus
@@ -206,11 +207,16 @@ def _read_fits(path: Path, limits: FileLimits) -> Table:
         for hdu in objects or tables[:1]:
             if isinstance(hdu, fits.BinTableHDU):
                 refuse_long_arrays(hdu, budget)
-        if objects:
-            return _ldac(hdus, objects)
-        if tables:
+        if objects or tables:
             # NaN stays NaN, so that errors are not reported as missing values
-            return Table.read(tables[0], format="fits", mask_invalid=False)
+            table = (
+                _ldac(hdus, objects)
+                if objects
+                else Table.read(tables[0], format="fits", mask_invalid=False)
+            )
+            if warning:
+                table.meta[MISSING_EXTENSIONS] = warning
+            return table
     raise FormatError("holds no table extension", where=str(path), do="give a FITS table")
 
 

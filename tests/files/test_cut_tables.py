@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
+import bayesdist as bd
 from bayesdist.errors import FormatError
 from bayesdist.files.tables import read_table
 from bayesdist.products.common.content import read_content
 from bayesdist.products.registry import open_document
+from tests.app.support import good
 
 KINDS = {
     "a.ecsv": {"format": "ascii.ecsv"},
@@ -164,3 +166,25 @@ def test_a_fits_file_that_was_cut_between_two_hdus(tmp_path, caplog, stated, say
         read(path)
         warned = [r for r in caplog.records if "states 2 extensions (NEXTEND)" in r.message]
         assert len(warned) == says
+    columns = {"x": [1.0, 900.0], "y": [2.0, 800.0], "u": [1.0, 900.0], "v": [2.0, 800.0]}
+    notes = bd.Matches.from_table(
+        Table(columns, meta=read_table(path).meta), unit="pix", sigma=0.1
+    ).notes
+    assert any("states 2 extensions (NEXTEND)" in note for note in notes) == says
+
+
+def test_a_command_shows_a_warning_of_a_file_once_and_as_a_warning(tmp_path):
+    """`init` reads a table several times."""
+    rng = np.random.default_rng(5)
+    x, y = rng.uniform(1, 1000, (2, 300))
+    u, v = x - 500 + 0.05 * rng.normal(size=300), y - 500 + 0.05 * rng.normal(size=300)
+    path = tmp_path / "stars.fits"
+    Table({"x": x, "y": y, "u": u, "v": v, "mag": rng.uniform(14, 20, 300)}).write(path)
+    raw = path.read_bytes()
+    end = raw.index(b"END" + 77 * b" ")
+    card = b"NEXTEND = 3".ljust(80)
+    path.write_bytes(raw[:end] + card + raw[end : end + 80] + raw[end + 160 :])
+    err = good("init", tmp_path / "config.toml", "--matches", path).err
+    lines = [line for line in err.splitlines() if "NEXTEND" in line]
+    assert len(lines) == 1
+    assert lines[0].startswith("WARNING: ")

@@ -27,6 +27,7 @@ from bayesdist.data.tables.checks import absent, row_number, without_missing
 from bayesdist.data.tables.column import Quantities, length_in_mm, unit_of, without_unit
 from bayesdist.data.tables.names import ALIASES, ASSUMED, PAIRS, find_columns
 from bayesdist.errors import InputError
+from bayesdist.files.fits import MISSING_EXTENSIONS
 from bayesdist.files.parquet import arrow_table
 from bayesdist.utils.arrays import Float
 
@@ -258,6 +259,8 @@ def match_arguments(
     table = with_variances(original)
     column_names, options, notes = columns_read(table.colnames, table.meta, options, source=source)
     check_ellipses(original, column_names, source)
+    if MISSING_EXTENSIONS in table.meta:
+        notes = (f"{source}: {table.meta[MISSING_EXTENSIONS]}", *notes)
     if len(table) == 0:
         raise InputError("holds no rows", where=source, do="give a table with matched stars")
     if options.plate_scale is not None:

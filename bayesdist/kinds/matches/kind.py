@@ -90,8 +90,9 @@ class MatchesKind(RunKind[MatchesConfig, Matches]):
     def fit_notes(self, run: Run) -> Iterator[tuple[int, str]]:
         """Notes and warnings about the stars."""
         matches, fit = run.placed, run.fit
+        warnings = _warnings_of_files(matches)
         for note in matches.notes:
-            yield logging.INFO, note
+            yield logging.WARNING if note in warnings else logging.INFO, note
         for reason, count in matches.rejected.items():
             yield logging.INFO, f"{count} rows were left out in reading: {reason}"
         for text in doubts_on_run(run):
@@ -110,11 +111,13 @@ class MatchesKind(RunKind[MatchesConfig, Matches]):
             yield logging.WARNING, majority
 
     def checks(self, run: Run) -> tuple[Check, ...]:
-        """Check of positions that were probably computed from the pixels; empty if none were."""
+        """Checks of positions that were probably computed from the pixels, and of cut files."""
         text = doubt_on_positions(run)
-        if not text:
-            return ()
-        return (Check("Matching", "Origin of the positions", "", "", "warn", text, LARGER),)
+        names = {text: "Origin of the positions"} if text else {}
+        names |= dict.fromkeys(_warnings_of_files(run.placed), "Files of the matches")
+        return tuple(
+            Check("Matching", name, "", "", "warn", text, LARGER) for text, name in names.items()
+        )
 
     def source(self, directory: RunDirectory) -> RunInput | None:
         """Matches in the format of a mission; None for tables."""
@@ -209,6 +212,11 @@ def read_stars(config: MatchesConfig, base: Path) -> Matches:
     data, size = config.data, config.detector.size
     stars = read_configured(data.paths(base), data, size=size, chips=config.chip)
     return stars.named_below(str(base))
+
+
+def _warnings_of_files(matches: Matches) -> tuple[str, ...]:
+    """Notes on files that are probably cut."""
+    return tuple(note for note in dict.fromkeys(matches.notes) if "(NEXTEND)" in note)
 
 
 MATCHES = MatchesKind()
