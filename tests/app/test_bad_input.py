@@ -488,10 +488,24 @@ def test_init_warns_of_pixels_before_the_first(tmp_path, stars):
     table = stars.copy()
     table["x"] -= CENTRE[0]
     table.write(tmp_path / "middle.ecsv")
-    err = good("init", tmp_path / "c.toml", "--matches", tmp_path / "middle.ecsv").err
+    made = good("init", tmp_path / "c.toml", "--matches", tmp_path / "middle.ecsv")
+    err = made.err
     n = int(((table["x"] < 0.5) | (table["y"] < 0.5)).sum())
+    said = f"{n} of {len(table)} positions lie outside these pixels"
+    assert said in (tmp_path / "c.toml").read_text()
+    assert f"{len(table)} matches, of which {n} lie outside the detector" in made.out
+    assert "outside the" in cli("check", tmp_path / "c.toml").err
     assert f"middle.ecsv: {n} of {len(table)} positions lie before the first pixel" in err
     assert f"x from {table['x'].min():.1f}" in err
+
+
+def test_a_draft_says_how_many_stars_are_outside_the_size_that_was_given(tmp_path, stars):
+    stars.write(tmp_path / "stars.ecsv")
+    common = "init", tmp_path / "c.toml", "--matches", tmp_path / "stars.ecsv", "--force"
+    assert "outside" not in good(*common).out + (tmp_path / "c.toml").read_text()
+    n = int(((stars["x"] > 500.5) | (stars["y"] > 600.5)).sum())
+    out = good(*common, "--size", "500", "600").out
+    assert f"{len(stars)} matches, of which {n} lie outside the detector" in out
 
 
 def test_init_refuses(tmp_path, stars):

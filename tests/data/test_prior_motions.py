@@ -534,3 +534,19 @@ def test_matches_with_assumed_motions_are_marked_wherever_they_come_from(rng, tm
         bd.fit_by_magnitude(stored, bd.build_model(stored.load(), order=1, size=(1000, 1000)))
     with pytest.raises(InputError, match="no star has a measured motion"):
         stars.select(gone).without_assumed_motions()
+
+
+@pytest.mark.parametrize("n", [5, 12])
+def test_a_match_that_fails_for_too_few_motions_says_so(n, rng):
+    t, _ = field()
+    detections, wcs = seen_table(t, rng)
+    few = masked(t, np.arange(600) >= n)
+    options = {"radius": 0.5, "wcs": wcs, "epoch": EPOCH}
+    words = f"{600 - n} of 600 catalogue stars are left out, as they have no proper motion"
+    with pytest.raises(InputError, match=words) as error:
+        bd.match(detections, few, **options)
+    assert "motion_prior" in error.value.do
+    assert len(bd.match(detections, few, **options, motion_prior=10.0)) > 500
+    with pytest.raises(InputError) as error:  # of another field
+        bd.match(detections, t[:5], **options)
+    assert "motion" not in str(error.value)

@@ -206,6 +206,19 @@ class _Stars:
     epoch: float | None  # epoch of the positions, if it is not a column
     mag: Float | None  # (M,), infinite if unknown
     notes: tuple[str, ...]
+    n_unmoved: int = 0  # stars that are left out because they have no motion
+
+    def failure(self, error: InputError) -> InputError:
+        """Error of matching that names missing motions if most stars are left out for them."""
+        if self.n_unmoved <= len(self.rows):
+            return error
+        return InputError(
+            f"{error.cause}; {self.n_unmoved} of {self.n_unmoved + len(self.rows)} catalogue stars "
+            "are left out, as they have no proper motion",
+            where=error.where,
+            do="give errors of positions and motions and motion_prior, a catalogue with more "
+            'motions, or leave out the motions: catalogue_columns={"pm_ra": "", "pm_dec": ""}',
+        )
 
     def at(self, epoch: float | None) -> tuple[Float, Float]:
         """Right ascension and declination (M,) in degrees at an epoch."""
@@ -396,7 +409,8 @@ def _reference(
     mag = None
     if "mag" in column_names:
         mag = np.nan_to_num(quantities["mag"].known_numbers(), nan=np.inf)
-    return _Stars(quantities, rows, moving, epoch, mag, notes)
+    n_unmoved = counts.get("no proper motion", 0)
+    return _Stars(quantities, rows, moving, epoch, mag, notes, n_unmoved)
 
 
 def _detections(
@@ -607,18 +621,22 @@ class _Found:
             rough_detections.ra[group.rows], rough_detections.dec[group.rows], ra, dec
         )
         if len(nearby) < MIN_PAIRS:
-            raise InputError(
+            error = InputError(
                 f"{len(nearby)} catalogue stars lie in the field of the detections: {place}",
                 where=group.name,
                 do="give the WCS of this image, or a catalogue of its field",
             )
+            raise self.stars.failure(error)
         points = np.column_stack(
             tangent_plane(rough_detections.ra[group.rows], rough_detections.dec[group.rows], point)
         )
         reference = np.column_stack(tangent_plane(ra[nearby], dec[nearby], point))
         mag = None if rough_detections.mag is None else rough_detections.mag[group.rows]
         mags = None if mag is None or self.stars.mag is None else (mag, self.stars.mag[nearby])
-        pairs = _aligned_pairs(points, reference, mags, radius, group.name, place)
+        try:
+            pairs = _aligned_pairs(points, reference, mags, radius, group.name, place)
+        except InputError as error:
+            raise self.stars.failure(error) from None
         self.index.append(group.rows[pairs.index])
         self.partner.append(nearby[pairs.partner])
         self.nominal.append(pairs.moved[pairs.index])

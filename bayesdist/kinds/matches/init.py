@@ -126,6 +126,11 @@ _AUTO = """\
 # format = "auto"               # {formats}
 """
 
+_OUTSIDE = """\
+# {n} of {total} positions lie outside these pixels, and 'bayesdist check' refuses them: correct the
+# size, the columns or data.pixel_origin, or leave these rows out of the table.
+"""
+
 _CENTRE = """\
 # reference_pixel = [{cx}, {cy}]  # zero point of the polynomial; the centre by default
 """
@@ -242,6 +247,12 @@ def init(
         )
         parse_config(text, str(path))
         outcome = f"for {n} matches; read it, then 'bayesdist check' it"
+        if outside := values.get("n_outside", 0):
+            outcome = (
+                f"a draft for {n} matches, of which {outside} lie outside the detector: 'bayesdist "
+                "check' refuses it until the size, the columns, data.pixel_origin or these rows of "
+                "the table are corrected"
+            )
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8", newline="\n")
     return f"{path}: {outcome}"
@@ -270,6 +281,9 @@ def _of_matches(
         size,
         Path(matches).stem,
     )
+    n_outside = _number_outside(table, sizes)
+    if n_outside:
+        detector = _OUTSIDE.format(n=n_outside, total=len(table)) + detector
     stated = {} if layout is None else _gaia(layout)
     nx, ny = next(iter(sizes.values()))
     centre = _CENTRE.format(cx=(nx + 1) / 2, cy=(ny + 1) / 2)
@@ -286,7 +300,18 @@ def _of_matches(
         "frames": "shift_rotation_scale" if len(table.exposure_names) > 1 else "none",
         "grid_y": max(3, round(32 * ny / nx) + 1),
         "unit": table.unit,
+        "n_outside": n_outside,
     } | stated
+
+
+def _number_outside(matches: Matches, sizes: Mapping[int, tuple[int, int]]) -> int:
+    """Number of matches outside their chip, whose pixels end half a pixel beyond the centres."""
+    n = 0
+    for batch in matches.batches():
+        nx, ny = np.array([sizes[number] for number in batch.chip_number.tolist()]).T
+        inside = (batch.x >= 0.5) & (batch.x <= nx + 0.5)
+        n += int((~(inside & (batch.y >= 0.5) & (batch.y <= ny + 0.5))).sum())
+    return n
 
 
 def _gaia(layout: TableLayout) -> dict[str, object]:
