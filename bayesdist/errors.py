@@ -3,7 +3,7 @@
 Every error that a user can correct is raised as a `BayesdistError`: one sentence that gives the
 cause, the location and the next action.  The command line prints this sentence and exits with the
 `exit_code` of the exception.  Any other exception is a defect of the program, which the command
-line reports as such (`bayesdist.app.commands.failures`).
+line reports as such (`bayesdist.app.cli`).
 """
 
 from __future__ import annotations

@@ -46,7 +46,7 @@ class Mission:
     # kinds of `[[budget]]` rows with one sigma: each a callable (name, kind, sigma, solution,
     # source) that returns an error term, such as `bayesdist.assess.terms.parameters.ScaleError`
     error_terms: Mapping[str, str] = field(default_factory=dict)
-    # sets of files for [products.release]: each a `bayesdist.app.products.release_set.ReleaseSet`
+    # sets of files for [products.release]: each a `bayesdist.app.products.ReleaseSet`
     releases: Mapping[str, str] = field(default_factory=dict)
     # further checks of files, by the key of their format, which defines the arguments: for "sip" a
     # `bayesdist.formats.sip.lint.Explanation`

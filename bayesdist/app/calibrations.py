@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 from pydantic import TypeAdapter
 
-from bayesdist.app.artefacts.parts import TABLES, read_tables
-from bayesdist.app.artefacts.stored_fit import FIT_AGAIN
-from bayesdist.app.products.made_files import with_facts_of_run
+from bayesdist.app.parts import FIT_AGAIN, TABLES, read_tables
+from bayesdist.app.products import with_facts_of_run
 from bayesdist.app.run import Run
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.store.summary import Summary

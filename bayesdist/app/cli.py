@@ -1,14 +1,21 @@
-"""Command line: all commands, and the conversion of errors to a sentence and an exit code."""
+"""Command line: all commands, and the conversion of errors to a sentence and an exit code.
+
+Defects of the package and limits of the machine have exit codes of their own.
+"""
 
 from __future__ import annotations
 
 import gc
 import os
+import platform
 import shlex
 import signal
 import sys
+import tempfile
+import traceback
 import warnings
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import click
@@ -31,14 +38,12 @@ COMMANDS = "bayesdist.app.commands"
 CORE = {
     name: f"{COMMANDS}.{module}:{name.replace('-', '_')}"
     for module, names in {
-        "runs": "check run stage report requirements budget",
-        "planning": "plan select-order",
-        "calibrations": "monitor compare inspect apply convert",
-        "documentation": "docs",
+        "runs": "check run stage report requirements budget plan select-order",
+        "files": "monitor compare inspect apply convert docs",
     }.items()
     for name in names.split()
 }
-SIMULATED = {"camera": f"{COMMANDS}.simulated:camera"}
+SIMULATED = {"camera": f"{COMMANDS}.files:camera"}
 RENAMED = {
     **{name: f"stage {name}" for name in ("match", "fit", "sample", "assess", "export")},
     "validate": "requirements",
@@ -52,7 +57,6 @@ EPILOG = (
     "bayesdist: please report it; 71 not enough memory; 74 a file cannot be read or written; "
     "130 interrupted by the user; 143 terminated by the system or a batch queue."
 )
-
 
 EXAMPLES = {
     "check": "check camera.toml",
@@ -70,6 +74,9 @@ EXAMPLES = {
     "convert": "convert camera.hdr --to tpv -o camera-tpv.hdr",
     "docs": "docs method",
 }
+
+# as in sysexits.h: EX_SOFTWARE, EX_OSERR, EX_IOERR, EX_DATAERR
+DEFECT, NO_MEMORY, NO_SYSTEM, TOO_DEEP = 70, 71, 74, 65
 
 
 def _renamed(name: str, new: str) -> RenamedError:
@@ -129,6 +136,37 @@ class _Root(LazyGroup):
         return _exit_code(lambda: super(_Root, self).invoke(ctx), ctx.obj or "bayesdist")
 
 
+def _exit_code(call: Callable[[], int | None], command: str) -> int:
+    """Exit code of a call; errors are printed as one sentence."""
+    try:
+        with raising_interrupts():
+            return call() or 0
+    except click.exceptions.Exit as end:  # after printing help
+        return end.exit_code
+    except click.ClickException as error:
+        error.show(file=sys.stderr)
+        return error.exit_code
+    except BayesdistError as error:
+        sentence = " ".join(str(error).split())  # messages of libraries may have several lines
+        if len(sentence) > _LONGEST:  # it contains a long quotation
+            sentence = f"{sentence[: _LONGEST // 2]} ... {sentence[-_LONGEST // 2 :]}"
+        print(f"bayesdist: {sentence}", file=sys.stderr)
+        return error.exit_code
+    except (KeyboardInterrupt, click.Abort):
+        handler = installed_handler()
+        terminated = handler is not None and handler.terminated
+        what, code = ("terminated", TERMINATED) if terminated else ("interrupted", INTERRUPTED)
+        print(f"bayesdist: {what}; resume with --resume", file=sys.stderr)
+        return code
+    except BrokenPipeError:  # the reader of the pipe has closed it
+        sys.stderr.close()
+        return 0
+    except Exception as error:  # not converted to a message at a lower level
+        code, sentence = failure(error, command)
+        print(f"bayesdist: {sentence}", file=sys.stderr)
+        return code
+
+
 bayesdist = click.version_option(__version__, message="bayesdist %(version)s")(
     _Root(
         "bayesdist",
@@ -180,38 +218,53 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
 
 
-def _exit_code(call: Callable[[], int | None], command: str) -> int:
-    """Exit code of a call; errors are printed as one sentence."""
-    try:
-        with raising_interrupts():
-            return call() or 0
-    except click.exceptions.Exit as end:  # after printing help
-        return end.exit_code
-    except click.ClickException as error:
-        error.show(file=sys.stderr)
-        return error.exit_code
-    except BayesdistError as error:
-        sentence = " ".join(str(error).split())  # messages of libraries may have several lines
-        if len(sentence) > _LONGEST:  # it contains a long quotation
-            sentence = f"{sentence[: _LONGEST // 2]} ... {sentence[-_LONGEST // 2 :]}"
-        print(f"bayesdist: {sentence}", file=sys.stderr)
-        return error.exit_code
-    except (KeyboardInterrupt, click.Abort):
-        handler = installed_handler()
-        terminated = handler is not None and handler.terminated
-        what, code = ("terminated", TERMINATED) if terminated else ("interrupted", INTERRUPTED)
-        print(f"bayesdist: {what}; resume with --resume", file=sys.stderr)
-        return code
-    except BrokenPipeError:  # the reader of the pipe has closed it
-        sys.stderr.close()
-        return 0
-    except Exception as error:  # not converted to a message at a lower level
-        from bayesdist.app.commands.failures import failure
-
-        code, sentence = failure(error, command)
-        print(f"bayesdist: {sentence}", file=sys.stderr)
-        return code
-
-
 if __name__ == "__main__":
     sys.exit(program())
+
+
+def failure(error: Exception, command: str) -> tuple[int, str]:
+    """Exit code and sentence for an exception that was not handled at a lower level."""
+    if isinstance(error, MemoryError):
+        return NO_MEMORY, (
+            "the memory of this machine is not enough; give fewer stars, draws or grid points, or "
+            "use a machine with more."
+        )
+    if isinstance(error, OSError):  # refused by the operating system
+        prefix = f"{error.filename}: " if error.filename else ""
+        reason = str(error.strerror or error).rstrip(".")
+        return NO_SYSTEM, f"{prefix}{reason}; check the path, the disk and your permissions."
+    traceback_file = _written(error, command)
+    report = "could not be written" if traceback_file is None else f"is in {traceback_file}"
+    if isinstance(error, RecursionError):
+        return TOO_DEEP, (
+            "something is nested too deep to be followed; check the file that was read, and if it "
+            f"is as it should be, report a defect: the traceback {report}."
+        )
+    first = " ".join(str(error).split())[:160].rstrip(".")
+    defect = f"{type(error).__name__}: {first}" if first else type(error).__name__
+    return DEFECT, (
+        f"this is a defect of bayesdist, whatever the input ({defect}); please report it, with the "
+        f"command and its input if you may: the traceback {report}."
+    )
+
+
+def _written(error: Exception, command: str) -> Path | None:
+    """Write the traceback to a file in the current or the temporary folder; None if impossible."""
+    text = "\n".join(
+        [
+            f"command   {command}",
+            f"bayesdist {__version__}",
+            f"python    {sys.version.split()[0]}, {platform.platform()}",
+            "",
+            "".join(traceback.format_exception(error, limit=-40)),
+        ]
+    )
+    for folder in (".", tempfile.gettempdir()):
+        try:
+            handle, name = tempfile.mkstemp(".txt", "bayesdist-error-", folder, text=True)
+            with os.fdopen(handle, "w", encoding="utf-8", errors="replace") as stream:
+                stream.write(text)
+        except OSError:
+            continue
+        return Path(name).absolute()
+    return None

@@ -18,9 +18,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from bayesdist.app.assessment.diagnosing import diagnostics_of_run
-from bayesdist.app.assessment.evaluating import evaluation_of_run
-from bayesdist.app.products.export import export
+from bayesdist.app.diagnosing import diagnostics_of_run
+from bayesdist.app.evaluating import evaluation_of_run
+from bayesdist.app.products import export
 from bayesdist.app.report import report
 from bayesdist.app.run import Run
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.app.products.made_files import product_of_run, with_facts_of_run
+from bayesdist.app.products import product_of_run, with_facts_of_run
 from bayesdist.app.run import Positions, Run
 from bayesdist.assess import ErrorBudget, Margin, UncertaintyMap
 from bayesdist.assess.budget import budget_of, place_budget

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from bayesdist.app.assessment.error_terms import (
+from bayesdist.app.calibrations import difference_from_previous
+from bayesdist.app.diagnosing import check_pairs
+from bayesdist.app.evaluating import (
     assessment_rng,
     error_model_of_fit,
     rehearsal_settings,
 )
-from bayesdist.app.assessment.periods import check_pairs
-from bayesdist.app.calibrations import difference_from_previous
-from bayesdist.app.products.made_files import product_of_run, rehearse_files, rehearse_outline
+from bayesdist.app.products import product_of_run, rehearse_files, rehearse_outline
 from bayesdist.app.run import Run
 from bayesdist.assess import Requirement
 from bayesdist.assess.budget import budget_of

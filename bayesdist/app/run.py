@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING, Any, Self, TypeAlias, TypeVar
 import numpy as np
 
 from bayesdist.app import hooks
-from bayesdist.app.artefacts.parts import NO_TABLES, Part, StoredLookupTables
-from bayesdist.app.artefacts.stars import QUOTED, ErrorLaw, RunInput, StarReader
+from bayesdist.app.parts import NO_TABLES, Part, StoredLookupTables
 from bayesdist.app.python_terms import python_terms
+from bayesdist.app.result_files import load_diagnostics, load_evaluation
+from bayesdist.app.stars import QUOTED, ErrorLaw, RunInput, StarReader
 from bayesdist.app.store import as_json
 from bayesdist.app.store.rundir import RunDirectory
-from bayesdist.app.tables.result_files import load_diagnostics, load_evaluation
 from bayesdist.assess import ErrorBudget, Margin, Requirement, UncertaintyMap
 from bayesdist.assess.drawn import DrawnErrors
 from bayesdist.assess.evaluation import Evaluation, EvaluationSettings
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from xarray import DataTree
 
     from bayesdist.app.config import Config
-    from bayesdist.app.kinds.kind import RunKind
+    from bayesdist.app.kind import RunKind
     from bayesdist.assess.comparison.compare import Comparison
     from bayesdist.calibration.wcs import CalibrationWCS
     from bayesdist.report.run_plots import RunPlots

@@ -9,8 +9,8 @@ from unittest.mock import patch
 
 import numpy as np
 
-from bayesdist.app.assessment.error_terms import assessment_rng
 from bayesdist.app.config import load_config
+from bayesdist.app.evaluating import assessment_rng
 from bayesdist.app.run import Run
 from bayesdist.app.stages import make_stages
 from bayesdist.app.store.rundir import RunDirectory

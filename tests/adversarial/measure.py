@@ -15,9 +15,8 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.app.assessment.error_terms import assessment_rng
-from bayesdist.app.assessment.evaluating import margins_of_run
 from bayesdist.app.config import load_config
+from bayesdist.app.evaluating import assessment_rng, margins_of_run
 from bayesdist.app.run import Run
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess import Margin, Requirement

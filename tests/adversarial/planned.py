@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from bayesdist.app.assessment.evaluating import margins_of_run
 from bayesdist.app.commands.on_runs.plan import content_of, futures_of, schedules_of
+from bayesdist.app.evaluating import margins_of_run
 from bayesdist.app.run import Run
 from bayesdist.assess import Requirement
 from bayesdist.assess.planning import exposures_needed

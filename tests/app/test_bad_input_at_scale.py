@@ -15,7 +15,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from bayesdist.app import saving
+from bayesdist.app import stages
 from bayesdist.kinds.matches import sources as app_matches
 from tests.app.support import (
     begin_stagewise,
@@ -220,20 +220,20 @@ def test_a_part_that_vanishes_before_it_is_written_about(job, tmp_path, monkeypa
 
     run = begin_stagewise_here(job, tmp_path)
     path, kept = job.parent / "stars" / "b.parquet", tmp_path / "kept.parquet"
-    real = saving._write_part
+    real = stages._write_part
 
     def vanish(*arguments):
         real(*arguments)
         path.rename(kept)
 
     monkeypatch.setattr("bayesdist.data.batches.BATCH", PART)
-    monkeypatch.setattr(saving, "_write_part", vanish)
+    monkeypatch.setattr(stages, "_write_part", vanish)
     result = cli("stage", "sample", run, "-q")
     assert result.code == 1
     one_sentence(result.err, "b.parquet", "does not exist")
     assert [p.name for p in (run / "stars").iterdir()] == ["part-00000.parquet"]
     assert "sample" not in json.loads((run / "run.json").read_text())["stages"]
-    monkeypatch.setattr(saving, "_write_part", real)
+    monkeypatch.setattr(stages, "_write_part", real)
     shutil.move(kept, path)
     good("stage", "sample", run)
     parts = [pq.read_table(p) for p in sorted((run / "stars").iterdir())]

@@ -9,9 +9,9 @@ import pytest
 
 from bayesdist.app.config.section import RunDetector
 from bayesdist.app.pipeline import evaluate
+from bayesdist.app.result_files import load_diagnostics, load_evaluation
 from bayesdist.app.run import Run
 from bayesdist.app.store.rundir import RunDirectory
-from bayesdist.app.tables.result_files import load_diagnostics, load_evaluation
 from bayesdist.errors import InputError
 from bayesdist.kinds.matches.config import MatchesConfig
 

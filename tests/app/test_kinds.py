@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bayesdist.app.artefacts.stars import ErrorLaw, StarReader
-from bayesdist.app.artefacts.stored_fit import read_stored_fit, write_stored_fit
+from bayesdist.app.parts import read_stored_fit, write_stored_fit
 from bayesdist.app.pipeline import fit, match, sample
 from bayesdist.app.run import Run
-from bayesdist.app.saving import FIT_ARTEFACTS, fit_sections
+from bayesdist.app.stages import FIT_ARTEFACTS, fit_sections
+from bayesdist.app.stars import ErrorLaw, StarReader
 from bayesdist.app.store import as_json
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data import MagnitudeErrors

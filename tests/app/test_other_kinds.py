@@ -47,9 +47,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesdist.app.kinds.kind import RunKind
-from bayesdist.app.artefacts.stars import set_aside
-from bayesdist.app.artefacts.parts import Part
+from bayesdist.app.kind import RunKind
+from bayesdist.app.stars import set_aside
+from bayesdist.app.parts import Part
 from bayesdist.assess.terms.parameters import ScaleError
 from bayesdist.data import Matches
 from bayesdist.infer import GaussianPriors, build_model, fit_linear

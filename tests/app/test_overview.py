@@ -7,7 +7,7 @@ import json
 import pytest
 from lxml import html as lxml_html
 
-from bayesdist.app.commands.on_runs.overview import overview
+from bayesdist.app.report import overview
 from bayesdist.errors import InputError
 from bayesdist.report.run_report import OverviewRow, write_overview
 from tests.app.support import cli

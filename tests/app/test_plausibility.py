@@ -12,7 +12,7 @@ from numpy.polynomial import legendre
 
 import bayesdist as bd
 from bayesdist.app.config import parse_config
-from bayesdist.app.kinds.plausibility import (
+from bayesdist.app.plausibility import (
     doubts_on_stars,
     refuse_empty_segments,
     scatter_about_polynomials,

@@ -10,7 +10,7 @@ import pytest
 
 import bayesdist as bd
 from bayesdist.app.config import load_config
-from bayesdist.app.config.model import PriorCalibrationBlock
+from bayesdist.app.config.fit import PriorCalibrationBlock
 from bayesdist.app.store import Record
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.calibration.calibration import calibration_of
@@ -302,11 +302,11 @@ frame = "shift"
 
 def test_a_run_goes_by_it(tmp_path):
     """The fit of a configuration, saved and loaded, and the inputs that are recorded."""
-    from bayesdist.app.artefacts.stored_fit import read_stored_fit, write_stored_fit
     from bayesdist.app.config import parse_config
+    from bayesdist.app.parts import read_stored_fit, write_stored_fit
     from bayesdist.app.pipeline import fit, match
     from bayesdist.app.run import Run
-    from bayesdist.app.saving import FIT_ARTEFACTS
+    from bayesdist.app.stages import FIT_ARTEFACTS
     from bayesdist.app.store.made_from import hashes_of
 
     rng, model = np.random.default_rng(9), model_of(3)

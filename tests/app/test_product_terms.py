@@ -10,8 +10,8 @@ from astropy.io import fits
 from astropy.table import Table
 from astropy.wcs import WCS
 
-from bayesdist.app.products.made_files import ProductInput, made_files, product_of_run
-from bayesdist.app.products.product_terms import _Laid, product_terms
+from bayesdist.app.evaluating import _Laid, product_terms
+from bayesdist.app.products import ProductInput, made_files, product_of_run
 from bayesdist.app.run import Run
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.calibration.calibration import GaussianSolution, calibration_of

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import bayesdist as bd
-from bayesdist.app.artefacts.stars import QUOTED
-from bayesdist.app.assessment.evaluating import margins_of_run
 from bayesdist.app.config import parse_config
-from bayesdist.app.config.assess import BudgetBlock
+from bayesdist.app.config.results import BudgetBlock
+from bayesdist.app.evaluating import margins_of_run
+from bayesdist.app.stars import QUOTED
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess import Catalogue, UserTerm, check_requirements, error_budget
 from bayesdist.assess.assessment import MISSING_TERMS

@@ -7,7 +7,7 @@ import pytest
 
 import bayesdist as bd
 from bayesdist import formats
-from bayesdist.app.products.made_files import product_of_run
+from bayesdist.app.products import product_of_run
 from bayesdist.app.run import Run
 from bayesdist.app.store.rundir import RunDirectory
 

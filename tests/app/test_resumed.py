@@ -12,8 +12,6 @@ import pytest
 
 from bayesdist.app.config import installed_kinds, load_config
 from bayesdist.app.store import Made
-from bayesdist.app.store.keys import digest_of
-from bayesdist.app.store.lock import locked
 from bayesdist.app.store.made_from import (
     LATER,
     LIMITS,
@@ -22,7 +20,9 @@ from bayesdist.app.store.made_from import (
     made_from_of,
     settings_of,
 )
+from bayesdist.app.store.record import digest_of
 from bayesdist.app.store.rundir import RunDirectory
+from bayesdist.app.store.store import locked
 from bayesdist.infer import load_posterior
 from tests.app.support import cli, good, refused, replaced, snapshot, summary_of, toml
 from tests.reduced import case_in_full

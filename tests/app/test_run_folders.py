@@ -212,7 +212,7 @@ def test_matches_of_a_folder_above_are_as_the_user_wants_them(finished, tmp_path
 
 def test_products_have_names_and_no_folders(tmp_path, finished):
     """What a release is called becomes the names of its files."""
-    from bayesdist.app.config.products import ReleaseBlock
+    from bayesdist.app.config.results import ReleaseBlock
 
     period = {"name": "pre", "years": (2002.0, 2009.0)}
     for given in ({"name": "../x"}, {"name": "a/b"}, {"name": ""}, {"name": "/x"}):

@@ -8,8 +8,8 @@ import sys
 
 import pytest
 
+from bayesdist.app.result_files import margins_text
 from bayesdist.app.screen import number, table_text
-from bayesdist.app.tables.margins import margins_text
 
 
 def test_table_text_aligns_text_left_and_numbers_right():

@@ -12,7 +12,7 @@ import xarray as xr
 from scipy.special import logsumexp
 from scipy.stats import norm
 
-from bayesdist.app.saving import write_star_files
+from bayesdist.app.stages import write_star_files
 from bayesdist.app.store.rundir import RunDirectory, part_files
 from bayesdist.data import batches, read_matches
 from bayesdist.files.parquet import parquet_units

@@ -8,7 +8,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from bayesdist.app.assessment.evaluating import margins_of_run
+from bayesdist.app.evaluating import margins_of_run
 from bayesdist.assess import Margin, Requirement
 from bayesdist.assess.budget_surface import JOINT as MODEL
 from bayesdist.assess.domain import field_statistic

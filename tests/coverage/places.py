@@ -10,7 +10,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from scipy.stats import norm
 
-from bayesdist.app.assessment.evaluating import drawn_errors_of_run
+from bayesdist.app.evaluating import drawn_errors_of_run
 from bayesdist.assess.budget import TOTAL, place_budget
 from bayesdist.assess.budget_surface import JOINT as MODEL
 from bayesdist.assess.domain import EvaluationDomain

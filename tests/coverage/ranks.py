@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import t as student_t
 
-from bayesdist.app.assessment.evaluating import drawn_errors_of_run, margins_of_run
+from bayesdist.app.evaluating import drawn_errors_of_run, margins_of_run
 from bayesdist.app.run import Run
 from bayesdist.assess import Requirement
 from bayesdist.assess.domain import EvaluationDomain, field_statistic

@@ -9,8 +9,7 @@ import pytest
 from astropy.io import fits
 
 import bayesdist as bd
-from bayesdist.app.products.export import _left_out
-from bayesdist.app.products.made_files import ProductInput
+from bayesdist.app.products import ProductInput, _left_out
 from bayesdist.calibration.calibration import GaussianSolution, calibration_of
 from bayesdist.products.common.document import PARAMETERS, BuildOptions
 from bayesdist.products.registry import (

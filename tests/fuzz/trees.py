@@ -8,7 +8,7 @@ from typing import Any
 
 from hypothesis import strategies as st
 
-from bayesdist.app.store.keys import digest_of
+from bayesdist.app.store.record import digest_of
 from tests.fuzz import values
 from tests.fuzz.mutation import KNOWABLE, OPEN, changes
 

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
-from bayesdist.app.commands.failures import DEFECT, NO_MEMORY, NO_SYSTEM, TOO_DEEP
+from bayesdist.app.cli import DEFECT, NO_MEMORY, NO_SYSTEM, TOO_DEEP
 from tests.fuzz.cases import Case
 from tests.fuzz.inputs import Input
 from tests.fuzz.mutation import HARMLESS, KNOWABLE, MUTATIONS, OPEN

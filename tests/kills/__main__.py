@@ -16,8 +16,7 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
-from bayesdist.app.store.lock import LOCK
-from bayesdist.app.store.store import ArtefactStore
+from bayesdist.app.store.store import LOCK, ArtefactStore
 from tests.app.support import good
 from tests.kills.compare import assert_same, assert_whole
 from tests.kills.jobs import JOBS

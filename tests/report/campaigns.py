@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.app.artefacts.parts import StoredLookupTables
+from bayesdist.app.parts import StoredLookupTables
 from bayesdist.data import MagnitudeErrors
 from bayesdist.diagnose.overlap import OverlapTest, _binned, align
 from bayesdist.diagnose.residuals.binned import binned_residuals

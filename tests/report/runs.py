@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from bayesdist.app.artefacts.parts import NO_TABLES, StoredLookupTables
-from bayesdist.app.artefacts.stars import QUOTED, ErrorLaw
-from bayesdist.app.kinds.kind import RunKind
+from bayesdist.app.kind import RunKind
+from bayesdist.app.parts import NO_TABLES, StoredLookupTables
+from bayesdist.app.stars import QUOTED, ErrorLaw
 from bayesdist.assess import (
     Requirement,
     UserTerm,

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from lxml import html as lxml_html
 
-from bayesdist.app.artefacts.parts import StoredLookupTables
+from bayesdist.app.parts import StoredLookupTables
 from bayesdist.assess.solution import coefficient_table
 from bayesdist.diagnose.checks import structure_checks
 from bayesdist.diagnose.residuals.misfit import Misfit

@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from bayesdist.app.artefacts.parts import StoredLookupTables
-from bayesdist.app.artefacts.stars import ErrorLaw
+from bayesdist.app.parts import StoredLookupTables
+from bayesdist.app.stars import ErrorLaw
 from bayesdist.data import Matches
 from bayesdist.diagnose.overlap import _at_first_epoch, align, chosen_exposures
 from bayesdist.infer.nodes.residuals import inside_chips

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from bayesdist.app.artefacts.parts import StoredLookupTables
+from bayesdist.app.parts import StoredLookupTables
 from bayesdist.assess.evaluation import Evaluation
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.diagnose.holdout.validation import HoldoutValidation

@@ -1,4 +1,4 @@
-"""Commands on runs: check, run, stages, requirements, budget, report."""
+"""Commands on runs: check, run, stages, requirements, budget, report, plan, select-order."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from bayesdist.app.commands.options import ON_RUNS, Unused, command
+from bayesdist.app.commands.options import ON_RUNS, CommaList, Unused, command, force
 
 STAGES = ("match", "fit", "sample", "diagnose", "evaluate", "assess", "export", "report")
 
@@ -43,9 +43,9 @@ def run(line: str, config: str, output: str | None, **options: Any) -> None:
     """Calibrate: match, fit, sample, diagnose, evaluate, export, report."""
     if options["resume"] and options["force"]:
         raise click.UsageError("--resume and --force exclude each other.")
+    from bayesdist.app.result_files import results_text
     from bayesdist.app.stages import run as whole_job
     from bayesdist.app.store.rundir import RunDirectory
-    from bayesdist.app.tables.margins import results_text
 
     folder = f"{Path(config).with_suffix('')}-run" if output is None else output
     path = whole_job(config, folder, command=line, **options)
@@ -89,7 +89,7 @@ def requirements(run: str, requirements: str) -> int:
     The exit code is 4 if a requirement is missed, otherwise 6 if one is undecided because something
     is in doubt, otherwise 5 if one is not shown to be met.
     """
-    from bayesdist.app.commands.on_runs.validate import validate
+    from bayesdist.app.commands.on_runs.budget import validate
 
     text, code = validate(run, requirements)
     click.echo(text)
@@ -158,6 +158,61 @@ def report(runs: tuple[str, ...], output: str | None) -> None:
         continue_stage(runs[0], "report")
         click.echo(f"{runs[0]}/report.html")
         return
-    from bayesdist.app.commands.on_runs.overview import overview
+    from bayesdist.app.report import overview
 
     click.echo(overview(runs, output or "reports.html"))
+
+
+@command(calls=f"{ON_RUNS}.plan:plan")
+@click.argument("run", metavar="RUN", type=click.Path())
+@click.option(
+    "--requirement", "name", metavar="NAME", show_default="all", help="Name of one requirement."
+)
+@click.option(
+    "--epochs",
+    type=CommaList(float),
+    default=(),
+    metavar="T,...",
+    help="Dates of further exposures, decimal years, separated by commas.",
+)
+def plan() -> None:
+    """Compute how many more exposures would meet the requirements."""
+
+
+@command(
+    calls=f"{ON_RUNS}.plan:order",
+    name="select-order",
+    unused=[
+        Unused(
+            "force",
+            "without an output file",
+            lambda o: o["output"] is None and o["figure"] is None,
+            "add -o or --figure",
+        )
+    ],
+)
+@click.argument("path", metavar="CONFIG.toml", type=click.Path())
+@click.option(
+    "--orders",
+    nargs=2,
+    type=int,
+    default=(3, 9),
+    metavar="LOW HIGH",
+    help="Lowest and highest order to compare.",
+)
+@click.option(
+    "--chip",
+    type=int,
+    metavar="N",
+    show_default="the only one",
+    help="Chip to use.",
+)
+@click.option(
+    "-o", "--output", type=click.Path(), metavar="orders.ecsv", help="Write the table to a file."
+)
+@click.option(
+    "--figure", type=click.Path(), metavar="orders.png", help="Draw the comparison into a file."
+)
+@force
+def select_order() -> None:
+    """Select the polynomial order."""

@@ -1,19 +1,24 @@
-"""Settings of fitting and sampling; each kind of run has the keys that it uses.
+"""Settings of the distortion model with its priors and tables, and of fitting and sampling.
 
-Keys that a kind lacks are constants of its class, so that code need not distinguish the kinds.
+Each kind of run has the keys that it uses.  Keys that a kind lacks are constants of its class, so
+that code need not distinguish the kinds.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from pydantic import Field, PositiveFloat, PositiveInt
 
-from bayesdist.app.config.section import Pair, Section
+from bayesdist.app.config.section import Epoch, Pair, Section
 from bayesdist.diagnose.correlated import DiscrepancyPriors
 from bayesdist.infer import Compute, OutlierMixture
+from bayesdist.model import TimeDependence
+from bayesdist.model.basis import MAX_ORDER
+
+FrameKind = Literal["none", "shift", "shift_rotation", "shift_rotation_scale", "affine"]
 
 
 class HoldoutBlock(Section):
@@ -174,3 +179,81 @@ class DiscrepancyBlock(Section):
     def priors(self) -> DiscrepancyPriors:
         """Priors of this section."""
         return DiscrepancyPriors(**self.model_dump())
+
+
+class BaseTdd(Section):
+    """Terms that drift linearly with time, with the keys that all kinds of runs have."""
+
+    if TYPE_CHECKING:
+
+        @property
+        def rates(self) -> str: ...
+
+    epoch0: Epoch | list[Epoch]
+    terms: list[tuple[Literal["u", "v"], Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]]]
+    breaks: list[Epoch] = Field(default_factory=list)
+
+    def time(self) -> TimeDependence | None:
+        """Time dependence of the model; None without terms."""
+        if not self.terms:
+            return None
+        epochs = self.epoch0 if isinstance(self.epoch0, list) else [self.epoch0]
+        return TimeDependence(tuple(self.terms), tuple(epochs), tuple(self.breaks))
+
+
+class Tdd(BaseTdd):
+    """Terms that drift linearly with time."""
+
+    rates: ClassVar[str] = "free"
+
+
+class Polynomials(Section):
+    """Order and reference pixel of the polynomials."""
+
+    order: Annotated[int, Field(ge=1, le=MAX_ORDER)]
+    reference_pixel: Pair | None = None
+
+
+class StructureBlock(Polynomials):
+    """Structure of the distortion model, with the keys that all kinds of runs have."""
+
+    if TYPE_CHECKING:
+
+        @property
+        def frames(self) -> FrameKind: ...
+        @property
+        def tdd(self) -> BaseTdd | None: ...
+
+
+class MatchedModel(StructureBlock):
+    """Structure of the distortion model, with the frames of the exposures."""
+
+    frames: FrameKind = "none"
+    tdd: Tdd | None = None
+
+
+class PriorBlock(Section):
+    """Gaussian prior on one parameter."""
+
+    parameter: str
+    mean: float
+    sigma: PositiveFloat
+
+
+class PriorCalibrationBlock(Section):
+    """Earlier calibration of the detector that is used as a prior."""
+
+    source: str
+    frame: FrameKind | None = None
+    filter: str | None = None
+    epoch: float | None = None
+    change_pix: Annotated[float, Field(ge=0)] = 0.0
+
+
+class TablesBlock(Section):
+    """Look-up tables to fit: of the detector, or of the filter in addition to the detector's."""
+
+    detector: str | None = None
+    method: Literal["field", "binned", "none"] = "field"
+    step: tuple[PositiveFloat, PositiveFloat] = (64.0, 64.0)
+    max_iterations: Annotated[int, Field(ge=1)] = 8

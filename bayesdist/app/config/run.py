@@ -9,13 +9,6 @@ from typing import TYPE_CHECKING, ClassVar, Self
 
 from pydantic import Field
 
-from bayesdist.app.config.assess import (
-    MEASURED_TERMS,
-    Assess,
-    BudgetBlock,
-    CatalogueBlock,
-    RequirementBlock,
-)
 from bayesdist.app.config.fit import (
     BaseFit,
     BaseOutliers,
@@ -24,18 +17,24 @@ from bayesdist.app.config.fit import (
     DiscrepancyBlock,
     Fit,
     HoldoutBlock,
+    MatchedModel,
     Outliers,
     Periods,
-    Sampler,
-)
-from bayesdist.app.config.model import (
-    MatchedModel,
     PriorBlock,
     PriorCalibrationBlock,
+    Sampler,
     StructureBlock,
     TablesBlock,
 )
-from bayesdist.app.config.products import MatchedProducts, Products
+from bayesdist.app.config.results import (
+    MEASURED_TERMS,
+    Assess,
+    BudgetBlock,
+    CatalogueBlock,
+    MatchedProducts,
+    Products,
+    RequirementBlock,
+)
 from bayesdist.app.config.section import (
     ChipBlock,
     Circle,

@@ -2,8 +2,15 @@
 
 from __future__ import annotations
 
-from bayesdist.app.store.keys import Adjustable, as_json, differences
-from bayesdist.app.store.record import Artefact, Record, versions, write_json
+from bayesdist.app.store.record import (
+    Adjustable,
+    Artefact,
+    Record,
+    as_json,
+    differences,
+    versions,
+    write_json,
+)
 from bayesdist.app.store.store import ArtefactStore, Made, Stage
 
 __all__ = [

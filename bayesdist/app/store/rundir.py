@@ -21,14 +21,12 @@ from bayesdist.app.store.made_from import (
     hashes_of,
     made_from_of,
     places_of,
-    with_seed,
-)
-from bayesdist.app.store.refusals import (
     refuse_another_solution,
     refuse_edited,
     refuse_foreign_files,
     refuse_inside_input,
     refuse_other_inputs,
+    with_seed,
 )
 from bayesdist.app.store.summary import head_of
 from bayesdist.assess import Requirement

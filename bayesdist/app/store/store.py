@@ -1,35 +1,57 @@
-"""Store of artefacts in a folder: loaded if they are up to date, otherwise made."""
+"""Store of artefacts in a folder: loaded if they are up to date, otherwise made.
+
+A lock restricts a folder to one process, names its holder, and ends with the process.
+"""
 
 from __future__ import annotations
 
 import logging
+import os
+import socket
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from fnmatch import fnmatch
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from time import monotonic
 from typing import Any, Generic, TypeVar
 
-from bayesdist.app.store.keys import Adjustable, as_json, difference, digest_of
-from bayesdist.app.store.lock import locked
 from bayesdist.app.store.record import (
     SCHEMA,
+    Adjustable,
     Artefact,
     FileMark,
     Record,
+    as_json,
+    difference,
+    digest_of,
     json_text,
     write_text,
 )
-from bayesdist.files.atomic import is_leftover, path_within, remove_leftovers, watched_writes
-from bayesdist.files.regular import read_bytes
+from bayesdist.errors import InputError
+from bayesdist.files.atomic import (
+    is_leftover,
+    made_folder,
+    path_within,
+    remove_leftovers,
+    watched_writes,
+)
+from bayesdist.files.regular import descriptor_for_writing, read_bytes
 
 T = TypeVar("T")
 
 RECORD, SUMMARY = "run.json", "summary.json"
 
 log = logging.getLogger("bayesdist")
+
+# not available on all systems
+fcntl: Any = import_module("fcntl") if find_spec("fcntl") else None
+
+LOCK = ".bayesdist.lock"
+LONGEST = 200  # bytes to read of a lock file
 
 
 @dataclass(frozen=True)
@@ -417,3 +439,71 @@ def _reason(known: Artefact | None, parts: Mapping[str, Any], harmed: str) -> st
 def _is_one_of(name: str, patterns: tuple[str, ...]) -> bool:
     """True if a file name matches one of some patterns."""
     return any(fnmatch(name, pattern) for pattern in patterns)
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Lock a folder against other processes, and create it if necessary.
+
+    The lock is held on an open file; the existence of the file does not matter.  A file left behind
+    by a killed process therefore blocks nothing.
+    """
+    made_folder(folder)
+    if fcntl is None:
+        yield
+        return
+    path = folder / LOCK
+    held = _acquired(path)
+    try:
+        with suppress(OSError):  # a full disk
+            os.ftruncate(held, 0)
+            since = datetime.now(UTC).isoformat(timespec="seconds")
+            holder = f"process {os.getpid()} on {socket.gethostname()} since {since}"
+            os.pwrite(held, holder.encode(), 0)
+        yield
+    finally:
+        with suppress(OSError):
+            path.unlink()  # while the lock is held, so that no other process's file is removed
+        os.close(held)
+
+
+def _acquired(path: Path) -> int:
+    """Descriptor of the locked file."""
+    while True:
+        try:
+            held = descriptor_for_writing(path)
+        except OSError as error:
+            raise InputError(
+                f"the folder cannot be written into ({error.strerror})",
+                where=str(path.parent),
+                do="make room, or choose a folder that you may write to",
+            ) from error
+        try:
+            fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            holder = _read(held)
+            os.close(held)
+            raise InputError(
+                f"another process is using this run{holder and f' ({holder})'}",
+                where=str(path.parent),
+                do="wait until it has ended, or choose another folder",
+            ) from error
+        except OSError as error:  # file systems without locks
+            log.debug("%s cannot be locked: %s", path, error)
+            return held
+        if _is_at(held, path):
+            return held
+        os.close(held)  # the previous holder has removed the file in the meantime
+
+
+def _is_at(held: int, path: Path) -> bool:
+    """True if an open file still has its name."""
+    with suppress(FileNotFoundError):
+        return os.path.samestat(os.fstat(held), path.lstat())
+    return False
+
+
+def _read(held: int) -> str:
+    """Text in a lock file; empty if there is none."""
+    text = os.pread(held, LONGEST, 0).decode("utf-8", errors="replace")
+    return "".join(c for c in text if c.isprintable())

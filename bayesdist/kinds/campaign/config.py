@@ -10,13 +10,16 @@ from pydantic import PositiveFloat
 
 from bayesdist.app.config.fit import (
     BaseFit,
+    BaseTdd,
     ComputeBlock,
     HoldoutBlock,
     MixtureOutliers,
+    PriorBlock,
     Sampler,
+    StructureBlock,
+    TablesBlock,
 )
-from bayesdist.app.config.model import BaseTdd, PriorBlock, StructureBlock, TablesBlock
-from bayesdist.app.config.products import Products, ReleaseBlock, with_formats
+from bayesdist.app.config.results import Products, ReleaseBlock, with_formats
 from bayesdist.app.config.run import FREE, RunConfig, rates_file, tables_file
 from bayesdist.app.config.section import Epoch, Unit
 from bayesdist.kinds.star_lists import StarListsBlock

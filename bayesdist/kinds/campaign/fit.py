@@ -16,11 +16,10 @@ from typing import cast
 
 import numpy as np
 
-from bayesdist.app.artefacts.parts import StoredLookupTables
-from bayesdist.app.artefacts.stars import QUOTED, ErrorLaw
-from bayesdist.app.artefacts.stored_fit import FitArtefacts, load_errors
 from bayesdist.app.config import Config
+from bayesdist.app.parts import FitArtefacts, StoredLookupTables, load_errors
 from bayesdist.app.run import Run
+from bayesdist.app.stars import QUOTED, ErrorLaw
 from bayesdist.app.store.made_from import input_name
 from bayesdist.app.store.rundir import PAIRS, RunDirectory, part_files
 from bayesdist.data import Matches, centroid_errors, read_matches, with_measured_motions

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 from astropy.coordinates import angular_separation
 
-from bayesdist.app.config.products import ReleaseBlock
-from bayesdist.app.kinds.kind import Outline
+from bayesdist.app.config.results import ReleaseBlock
+from bayesdist.app.kind import Outline
 from bayesdist.calibration.plane import ARCSEC
 from bayesdist.data import (
     ExposureLog,

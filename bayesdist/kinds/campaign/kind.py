@@ -10,10 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bayesdist.app.artefacts.parts import TABLES, read_tables
-from bayesdist.app.artefacts.stored_fit import read_stored_fit
-from bayesdist.app.kinds.kind import EvaluationDomain, Outline, Questions, RunKind
-from bayesdist.app.kinds.sampling import sample_stars
+from bayesdist.app.kind import EvaluationDomain, Outline, Questions, RunKind, sample_stars
+from bayesdist.app.parts import TABLES, read_stored_fit, read_tables
 from bayesdist.app.run import Run
 from bayesdist.assess.model import with_diagnosed_errors
 from bayesdist.assess.terms.correlated import LocalErrors, interpolation_term

@@ -18,14 +18,12 @@ from pathlib import Path
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.app.artefacts.parts import Part, read_tables
-from bayesdist.app.artefacts.stored_fit import converged_posterior
 from bayesdist.app.config import Config
-from bayesdist.app.config.model import TablesBlock
+from bayesdist.app.config.fit import TablesBlock
 from bayesdist.app.config.run import TABLES, rates_file, tables_file
+from bayesdist.app.parts import Part, converged_posterior, read_tables
 from bayesdist.app.run import Run
-from bayesdist.app.store.keys import attributes
-from bayesdist.app.store.output import write_table
+from bayesdist.app.store.record import attributes, write_table
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer import GaussianPriors, Posterior
 from bayesdist.infer.exposures.hierarchy import Settling

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.app.artefacts.parts import Part
-from bayesdist.app.artefacts.stars import set_aside
+from bayesdist.app.parts import Part
 from bayesdist.app.run import Run
+from bayesdist.app.stars import set_aside
 from bayesdist.app.store.rundir import PAIRS, part_files
 from bayesdist.assess.terms.parameters import ABERRATION, EXPOSURE_SCATTER, ScaleError
 from bayesdist.calibration.calibration import Calibration

@@ -15,12 +15,11 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.app.config.products import ReleaseBlock
-from bayesdist.app.products.export import published_tables
-from bayesdist.app.products.release_set import release_set
+from bayesdist.app.config.results import ReleaseBlock
+from bayesdist.app.products import published_tables, release_set
 from bayesdist.app.run import Run
 from bayesdist.app.screen import table_text
-from bayesdist.app.store.output import record_folder, write_table
+from bayesdist.app.store.record import record_folder, write_table
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.errors import InputError
 from bayesdist.infer.exposures.shared_drift import with_drift_of

@@ -14,15 +14,15 @@ from typing import Any
 import numpy as np
 import tomli_w
 
-from bayesdist.app.artefacts.stars import StarReader
 from bayesdist.app.config import parse_config
-from bayesdist.app.config.assess import RequirementBlock
+from bayesdist.app.config.results import RequirementBlock
 from bayesdist.app.pipeline import diagnose, evaluate, sample
 from bayesdist.app.python_terms import in_python_terms
 from bayesdist.app.rehearsal import rehearse
 from bayesdist.app.run import Run
-from bayesdist.app.run_folder import MATCHES_FILE
+from bayesdist.app.runs import MATCHES_FILE
 from bayesdist.app.screen import progress_bar
+from bayesdist.app.stars import StarReader
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess import Requirement, UserTerm
 from bayesdist.assess.requirements.requirement import as_requirements

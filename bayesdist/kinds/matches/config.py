@@ -19,14 +19,19 @@ from pydantic import (
     field_validator,
 )
 
-from bayesdist.app.config.fit import ComputeBlock, Fit, HoldoutBlock, Outliers, Periods, Sampler
-from bayesdist.app.config.model import (
+from bayesdist.app.config.fit import (
+    ComputeBlock,
+    Fit,
+    HoldoutBlock,
     MatchedModel,
+    Outliers,
+    Periods,
     PriorBlock,
     PriorCalibrationBlock,
+    Sampler,
     TablesBlock,
 )
-from bayesdist.app.config.products import MatchedProducts
+from bayesdist.app.config.results import MatchedProducts
 from bayesdist.app.config.run import RunConfig, calibration_file
 from bayesdist.app.config.section import (
     Epoch,

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from bayesdist.app.config import parse_config
-from bayesdist.app.kinds.plausibility import scatter_about_polynomials
-from bayesdist.app.store.output import refuse_existing
+from bayesdist.app.plausibility import scatter_about_polynomials
+from bayesdist.app.store.record import refuse_existing
 from bayesdist.data import FORMATS, Matches, read_star_lists
 from bayesdist.data.formats import (
     TableLayout,

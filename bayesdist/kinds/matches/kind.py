@@ -11,7 +11,26 @@ from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
-from bayesdist.app.artefacts.stars import (
+from bayesdist.app.config import Config
+from bayesdist.app.config.run import POSTERIOR, calibration_file
+from bayesdist.app.kind import RunKind
+from bayesdist.app.parts import (
+    FIT,
+    FitArtefacts,
+    converged_posterior,
+    hierarchy_of,
+    load_errors,
+    read_stored_fit,
+)
+from bayesdist.app.plausibility import (
+    doubt_on_positions,
+    doubts_on_run,
+    refuse_empty_segments,
+    refuse_stars,
+)
+from bayesdist.app.result_files import load_diagnostics
+from bayesdist.app.run import Run
+from bayesdist.app.stars import (
     QUOTED,
     ErrorLaw,
     RunInput,
@@ -20,26 +39,7 @@ from bayesdist.app.artefacts.stars import (
     set_aside,
     shards_of,
 )
-from bayesdist.app.artefacts.stored_fit import (
-    FIT,
-    FitArtefacts,
-    converged_posterior,
-    hierarchy_of,
-    load_errors,
-    read_stored_fit,
-)
-from bayesdist.app.config import Config
-from bayesdist.app.config.run import POSTERIOR, calibration_file
-from bayesdist.app.kinds.kind import RunKind
-from bayesdist.app.kinds.plausibility import (
-    doubt_on_positions,
-    doubts_on_run,
-    refuse_empty_segments,
-    refuse_stars,
-)
-from bayesdist.app.run import Run
 from bayesdist.app.store.rundir import RunDirectory
-from bayesdist.app.tables.result_files import load_diagnostics
 from bayesdist.assess.model import with_diagnosed_errors
 from bayesdist.calibration.calibration import Calibration, calibration_of
 from bayesdist.calibration.prior import CalibrationPrior, prior_of_calibration

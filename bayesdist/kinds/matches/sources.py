@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Unpack
 
-from bayesdist.app.artefacts.stars import RunInput
 from bayesdist.app.config import ChipBlock
+from bayesdist.app.stars import RunInput
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data import Matches, input_files, open_matches, read_matches
 from bayesdist.data.reading.options import ReadArguments

@@ -8,9 +8,17 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, PositiveFloat
 
-from bayesdist.app.config.fit import BaseOutliers, BaseSampler, ComputeBlock, Fit
-from bayesdist.app.config.model import PriorBlock, StructureBlock, TablesBlock, Tdd
-from bayesdist.app.config.products import SingleProducts, with_formats
+from bayesdist.app.config.fit import (
+    BaseOutliers,
+    BaseSampler,
+    ComputeBlock,
+    Fit,
+    PriorBlock,
+    StructureBlock,
+    TablesBlock,
+    Tdd,
+)
+from bayesdist.app.config.results import SingleProducts, with_formats
 from bayesdist.app.config.run import POSTERIOR, RunConfig
 from bayesdist.app.config.section import Epoch, Section, Unit, names_nominal
 from bayesdist.infer import OutlierMixture

@@ -16,11 +16,10 @@ from astropy.table import Column, Table
 from astropy.units import Unit
 from numpy.typing import NDArray
 
-from bayesdist.app.artefacts.parts import Part
-from bayesdist.app.artefacts.stars import ErrorLaw
-from bayesdist.app.artefacts.stored_fit import FIT_AGAIN, read_stored_fit
+from bayesdist.app.parts import FIT_AGAIN, Part, read_stored_fit
 from bayesdist.app.run import Run
-from bayesdist.app.store.output import write_table
+from bayesdist.app.stars import ErrorLaw
+from bayesdist.app.store.record import write_table
 from bayesdist.data import ReferenceCatalog
 from bayesdist.data.matches import Matches
 from bayesdist.data.storage import write_columns
@@ -227,7 +226,7 @@ class SelfCalibrated(Part):
         """Score tests of the residuals, with the stars eliminated."""
         return selfcal_score_tests(self.mode, mag=stars.mag, colour=stars.colour, epoch=stars.epoch)
 
-    # -- bayesdist.app.artefacts.parts.Part -------------------------------------------------------
+    # -- bayesdist.app.parts.Part -------------------------------------------------------
 
     def save(self, folder: Path) -> None:
         """Write the solution and the gauge to the folder of a run."""

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from bayesdist.app.config.section import one_chip
-from bayesdist.app.kinds.kind import Outline
+from bayesdist.app.kind import Outline
 from bayesdist.calibration.plane import ARCSEC
 from bayesdist.data import ReferenceCatalog, read_catalog, read_exposures
 from bayesdist.data.detections import Detections, detections_of

@@ -8,10 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bayesdist.app.kinds.further_exposures import FurtherExposures
-from bayesdist.app.kinds.kind import EvaluationDomain, Outline, Questions, RunKind
+from bayesdist.app.kind import EvaluationDomain, FurtherExposures, Outline, Questions, RunKind
 from bayesdist.app.run import Run
-from bayesdist.app.store.output import provenance_notes
+from bayesdist.app.store.record import provenance_notes
 from bayesdist.assess.planning import Schedule
 from bayesdist.assess.requirements.requirement import Requirement
 from bayesdist.infer import Posterior

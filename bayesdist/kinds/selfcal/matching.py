@@ -17,7 +17,7 @@ from typing import Any, TypedDict
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.app.artefacts.parts import Part
+from bayesdist.app.parts import Part
 from bayesdist.app.run import Run
 from bayesdist.app.screen import number
 from bayesdist.data import MagnitudeErrors

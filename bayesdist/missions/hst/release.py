@@ -12,8 +12,8 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from bayesdist.app.config.products import ReleaseBlock
-from bayesdist.app.products.release_set import ReleaseSet
+from bayesdist.app.config.results import ReleaseBlock
+from bayesdist.app.products import ReleaseSet
 from bayesdist.calibration.calibration import Calibration, calibration_of
 from bayesdist.calibration.orientation import lay_on, oriented
 from bayesdist.calibration.plane import Orientation

@@ -17,7 +17,7 @@ from astropy.table import Table
 from scipy.stats import poisson
 
 from bayesdist.app.screen import table_text
-from bayesdist.app.store.output import record_folder, write_table
+from bayesdist.app.store.record import record_folder, write_table
 from bayesdist.data.detections import Detections
 from bayesdist.data.matches import Matches
 from bayesdist.data.matching.pairs import mutual_pairs

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from bayesdist.app.screen import number
-from bayesdist.app.store.output import refuse_existing
+from bayesdist.app.store.record import refuse_existing
 from bayesdist.errors import InputError
 from bayesdist.formats.sip.files import read_sip, write_sip
 from bayesdist.formats.sip.header import SipHeader

@@ -15,13 +15,12 @@ import numpy as np
 from astropy.table import QTable
 
 from bayesdist.app.commands.on_files.convert import convert
+from bayesdist.app.result_files import results_text
 from bayesdist.app.run import Run
 from bayesdist.app.screen import number, table_text
 from bayesdist.app.stages import run
-from bayesdist.app.store.output import write_table
-from bayesdist.app.store.record import write_text
+from bayesdist.app.store.record import write_table, write_text
 from bayesdist.app.store.rundir import RunDirectory
-from bayesdist.app.tables.margins import results_text
 from bayesdist.data import Matches
 from bayesdist.errors import InputError
 from bayesdist.files.atomic import made_folder

@@ -13,7 +13,7 @@ from astropy.io import fits
 from astropy.table import Table
 
 import bayesdist as bd
-from bayesdist.app.artefacts.parts import read_tables
+from bayesdist.app.parts import read_tables
 from bayesdist.app.run import Run
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data import read_exposures, read_matches

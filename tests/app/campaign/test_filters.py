@@ -14,7 +14,7 @@ from astropy.table import Table
 
 import bayesdist.kinds.campaign.release
 import bayesdist.missions.hst.release
-from bayesdist.app.artefacts.parts import StoredLookupTables, read_tables, write_tables
+from bayesdist.app.parts import StoredLookupTables, read_tables, write_tables
 from bayesdist.app.run import Run
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess import LocalErrors

@@ -11,8 +11,7 @@ import pytest
 from pydantic import TypeAdapter
 
 from bayesdist.app.store import Record
-from bayesdist.app.store.keys import digest_of
-from bayesdist.app.store.record import SCHEMA
+from bayesdist.app.store.record import SCHEMA, digest_of
 from bayesdist.app.store.summary import Summary
 from bayesdist.errors import InputError
 from bayesdist.files.documents import model_of

@@ -10,7 +10,7 @@ import pytest
 
 from bayesdist.app.config import parse_config
 from bayesdist.app.store import differences
-from bayesdist.app.store.keys import as_json, difference, digest_of
+from bayesdist.app.store.record import as_json, difference, digest_of
 from tests.app.support import config_text
 
 

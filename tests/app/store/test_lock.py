@@ -9,7 +9,7 @@ import sys
 
 import pytest
 
-from bayesdist.app.store.lock import LOCK, locked
+from bayesdist.app.store.store import LOCK, locked
 from bayesdist.errors import InputError
 
 pytest.importorskip("fcntl", reason="this system knows no such locks")
@@ -17,7 +17,7 @@ pytest.importorskip("fcntl", reason="this system knows no such locks")
 HOLDER = """
 import sys, time
 from pathlib import Path
-from bayesdist.app.store.lock import locked
+from bayesdist.app.store.store import locked
 with locked(Path(sys.argv[1])):
     print("held", flush=True)
     time.sleep(600)

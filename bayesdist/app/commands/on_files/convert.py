@@ -16,7 +16,7 @@ from bayesdist.app.calibrations import (
     refuse_unused_date,
 )
 from bayesdist.app.screen import number as digits
-from bayesdist.app.store.output import refuse_existing
+from bayesdist.app.store.record import refuse_existing
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.inverse import detector_grid
 from bayesdist.calibration.plane import ARCSEC

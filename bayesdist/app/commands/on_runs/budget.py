@@ -1,18 +1,27 @@
-"""`bayesdist budget`: error budget of a position, or of the separation of two positions."""
+"""`bayesdist budget` and `bayesdist requirements`: errors and margins of finished runs.
+
+The error budget is that of a position, or of the separation of two positions.  Requirements are
+those of a separate file.
+"""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from bayesdist.app.commands.on_files.position_table import origin_line, read_positions
+from bayesdist.app.commands.on_files.inputs import origin_line, read_positions
+from bayesdist.app.config import load_requirements
+from bayesdist.app.evaluating import idle_dates, margins_of_run, validity_periods_of_run
+from bayesdist.app.result_files import margin_rows, margins_text, reasons_of, save_margins
 from bayesdist.app.run import Run
 from bayesdist.app.screen import number, table_text
 from bayesdist.app.store.rundir import RunDirectory
+from bayesdist.assess import Margin, Requirement
 from bayesdist.assess.budget import TOTAL, ErrorBudget, place_budget
 from bayesdist.assess.drawn import DrawnErrors
 from bayesdist.assess.maps import circular_error, per_axis
@@ -24,6 +33,9 @@ from bayesdist.errors import InputError
 SCHEMA = 1  # version of the output of --json
 COLUMNS = ("x", "y")
 CIRCLES = (("CE68", 0.68), ("CE95", 0.95))
+
+# by verdict, in order of precedence
+EXIT_CODES = {"missed": 4, "undecided": 6, "not shown": 5}
 
 
 def budget_at(
@@ -227,3 +239,63 @@ def _text(found: ErrorBudget, at: tuple[float, float], scale_mas: float | None) 
     if any(t.kind == PRODUCT for t in found.every):
         lines.append("rows of kind product come on top for the users of that file: in no total")
     return "\n".join(lines)
+
+
+def validate(run: str | Path, requirements: str | Path) -> tuple[str, int]:
+    """Judge a run that has been sampled, and replace its margins and validity periods.
+
+    Parameters
+    ----------
+    run : path
+    requirements : path
+        TOML file of ``[[requirement]]`` blocks.
+
+    Returns
+    -------
+    str
+        Text to print.
+    int
+        Exit code; see `exit_code`.
+    """
+    asked = load_requirements(requirements)
+    directory = RunDirectory.open(run)
+    with Run.of(directory) as opened:
+        directory.require("requirements", ("fit", "sample"))
+        asked = opened.config.within_field(asked)
+        with _named_after(requirements, asked):
+            margins = margins_of_run(opened, asked)
+            periods = validity_periods_of_run(opened, asked)
+        fit, posterior, gauge = opened.fit, opened.posterior, opened.gauge_words
+        with directory.locked(), directory.judged_by(asked):
+            save_margins(directory, fit, posterior, gauge, margins, periods)
+        report = directory / "report.html"
+        outdated = report.exists() and not directory.done("report")
+    idle = idle_dates(opened.config, asked, str(requirements))
+    lines = [*_lines(margins), *(period.sentence for period in periods)]
+    lines += [f"WARNING: {idle}"] if idle else []
+    if outdated:
+        lines.append(f"{report} shows earlier margins; renew it by 'bayesdist stage report {run}'")
+    return "\n".join(lines), exit_code(margins)
+
+
+def exit_code(margins: Sequence[Margin]) -> int:
+    """Exit code of the first verdict in `EXIT_CODES` that any margin has; 0 if there is none."""
+    verdicts = {m.verdict for m in margins}
+    return next((code for word, code in EXIT_CODES.items() if word in verdicts), 0)
+
+
+@contextmanager
+def _named_after(path: str | Path, asked: Sequence[Requirement]) -> Iterator[None]:
+    """Prefix errors of requirements with the name of their file."""
+    try:
+        yield
+    except InputError as error:
+        if not error.where.startswith(tuple(r.where for r in asked)):
+            raise
+        raise type(error)(error.cause, where=f"{path}: {error.where}", do=error.do) from error
+
+
+def _lines(margins: Sequence[Margin]) -> Iterator[str]:
+    rows = margin_rows(margins)
+    yield margins_text(rows)
+    yield from reasons_of(rows)

@@ -6,14 +6,14 @@ from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from bayesdist.app.artefacts.stars import in_circle
-from bayesdist.app.assessment.error_terms import idle_dates
 from bayesdist.app.config import load_config
-from bayesdist.app.kinds.plausibility import doubts_on_run
-from bayesdist.app.kinds.sampling import naming_displaced_stars
+from bayesdist.app.evaluating import idle_dates
+from bayesdist.app.kind import naming_displaced_stars
+from bayesdist.app.plausibility import doubts_on_run
 from bayesdist.app.rehearsal import rehearse
 from bayesdist.app.run import Run
 from bayesdist.app.screen import number
+from bayesdist.app.stars import in_circle
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.infer import Limits
 from bayesdist.infer.sampler.sample import predict_sampling

@@ -19,8 +19,7 @@ from bayesdist.app.calibrations import (
     refuse_unused_date,
     run_of,
 )
-from bayesdist.app.store.keys import attributes
-from bayesdist.app.store.output import record_folder, write_table
+from bayesdist.app.store.record import attributes, record_folder, write_table
 from bayesdist.assess.comparison.compare import (
     IDENTICAL,
     NOISE_SEED,

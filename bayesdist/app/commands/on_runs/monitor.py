@@ -11,10 +11,9 @@ from astropy.table import Table
 
 from bayesdist.app.commands.on_runs.compare import joined
 from bayesdist.app.config import Config, load_config
-from bayesdist.app.kinds.kind import RunKind
+from bayesdist.app.kind import RunKind
 from bayesdist.app.run import Run
-from bayesdist.app.store.keys import attributes
-from bayesdist.app.store.output import record_folder, write_table
+from bayesdist.app.store.record import attributes, record_folder, write_table
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess.comparison.change_maps import Monitored, change_maps, is_late
 from bayesdist.assess.comparison.compare import comparison_table, difference_table

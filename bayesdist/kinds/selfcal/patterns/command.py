@@ -17,7 +17,7 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from pydantic import Field, PositiveFloat
 
-from bayesdist.app.config.model import Polynomials
+from bayesdist.app.config.fit import Polynomials
 from bayesdist.app.config.reading import load_text, validated
 from bayesdist.app.config.section import (
     ChipBlock,
@@ -30,8 +30,7 @@ from bayesdist.app.config.section import (
     same_names,
 )
 from bayesdist.app.screen import table_text
-from bayesdist.app.store.keys import attributes
-from bayesdist.app.store.output import record_folder, write_table
+from bayesdist.app.store.record import attributes, record_folder, write_table
 from bayesdist.kinds.selfcal.config import Frames, MinDetections, scale_faults
 from bayesdist.kinds.selfcal.patterns.dithers import (
     KINDS,

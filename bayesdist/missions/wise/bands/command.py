@@ -16,8 +16,7 @@ import numpy as np
 from astropy.table import Table
 
 from bayesdist.app.screen import table_text
-from bayesdist.app.store.output import record_folder, write_table
-from bayesdist.app.store.record import write_text
+from bayesdist.app.store.record import record_folder, write_table, write_text
 from bayesdist.errors import InputError
 from bayesdist.formats.sip.build import sip_from_solution
 from bayesdist.missions.wise.assess.account import RowAccount

@@ -11,7 +11,7 @@ from astropy.table import Table
 from astropy.wcs import WCS
 from scipy import stats
 
-from bayesdist.app.store.output import write_table
+from bayesdist.app.store.record import write_table
 from bayesdist.data.sky import parallax_factors
 from bayesdist.infer import load_fit
 from bayesdist.kinds.selfcal.fit import star_table

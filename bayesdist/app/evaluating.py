@@ -1,25 +1,44 @@
-"""Differences between products as written and the solution of their run.
+"""Evaluation of a run: error model, maps, budget, margins, validity periods, and checks.
 
-Each format reads its files back (`read_back`).  A SIP header holds one chip at one date: drift to
-other dates and look-up tables are always left out.  Some formats have axes and a pixel of their
-own: the best-fitting shift, rotation and (common to all dates) scale are removed; the look-up
-tables of a released set are applied as well.  An inverse is compared with the forward terms of its
-own file, because users transform back and forth with the same file.
+The error model includes the differences between products as written and the solution.  Each format
+reads its files back (`read_back`).  A SIP header holds one chip at one date: drift to other dates
+and look-up tables are always left out.  Some formats have axes and a pixel of their own, and are
+compared in them.
 """
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
 
 from bayesdist.app.config import Config
-from bayesdist.app.config.products import ReleaseBlock
-from bayesdist.app.products.made_files import ProductInput, made_files
-from bayesdist.app.products.release_set import first_segments, release_set
+from bayesdist.app.config.results import ReleaseBlock
+from bayesdist.app.products import (
+    ProductInput,
+    first_segments,
+    made_files,
+    product_of_run,
+    release_set,
+)
+from bayesdist.app.run import Run
+from bayesdist.assess import Margin, Requirement, pixel_scale_of
+from bayesdist.assess.drawn import DrawnErrors
+from bayesdist.assess.evaluation import (
+    Evaluation,
+    EvaluationSettings,
+    drawn_errors,
+    evaluate,
+    judged,
+    validity_of,
+)
+from bayesdist.assess.model import ErrorModel, diagnosed_error_model, error_model
+from bayesdist.assess.requirements.margins import ValidityPeriod
+from bayesdist.assess.requirements.verdict import assumption_checks
 from bayesdist.assess.solution import place_of
 from bayesdist.assess.terms.forms import MEASURED, PRODUCT, Known, Row
 from bayesdist.calibration.calibration import Calibration
@@ -29,15 +48,158 @@ from bayesdist.model import corrected
 from bayesdist.model.grid import grid_pixels, mesh
 from bayesdist.products.common.document import Positions, ReadBack, by_calibrations
 from bayesdist.products.registry import read_back
+from bayesdist.utils import streams
 from bayesdist.utils.arrays import Float
+from bayesdist.utils.checks import Check, in_order
 
 log = logging.getLogger("bayesdist")
-
 
 FORWARD, INVERSE = "forward", "inverse"
 GRID = (33, 33)  # grid on which files are aligned with the solution
 ROUNDING = 1e-9  # pixels
 SKY_ROUNDING = 2e-9  # arcsec: rounding error of converting to an RA near 360 degrees and back
+
+
+def evaluation_of_run(run: Run) -> Evaluation:
+    """Maps, budget, margins and validity periods of a run that was sampled.
+
+    Diagnostics that the run does not have yet are computed.
+    """
+    if run.stored_diagnostics is None:
+        run = run.having(diagnostics=run.diagnostics)
+    config = run.config
+    return evaluate(
+        run.error_model,
+        run.diagnostics,
+        config.requirements(),
+        run.evaluation_settings,
+        assessment_rng(config),
+        fit=run.fit,
+        solution=run.solution,
+        checks=checks_besides_diagnostics(run),
+        files=file_errors(product_of_run(run), config, run.base),
+        null=run.kind.null_space(run),
+    )
+
+
+def drawn_errors_of_run(run: Run) -> DrawnErrors:
+    """Draws of all position errors, as for budget and margins, including those of products."""
+    files = file_errors(product_of_run(run), run.config, run.base)
+    arguments = run.error_model, run.diagnostics, run.evaluation_settings
+    return drawn_errors(*arguments, assessment_rng(run.config), files=files)
+
+
+def margins_of_run(run: Run, requirements: Sequence[Requirement]) -> tuple[Margin, ...]:
+    """Margins of a run for the given requirements."""
+    requirements = run.config.within_field(requirements)
+    arguments = run.error_model, run.diagnostics, requirements, run.evaluation_settings
+    return judged(*arguments, assessment_rng(run.config), checks=run.checks)
+
+
+def validity_periods_of_run(
+    run: Run, requirements: Sequence[Requirement]
+) -> tuple[ValidityPeriod, ...]:
+    """Validity periods of requirements, if anything depends on time."""
+    arguments = run.error_model, run.diagnostics, requirements, run.evaluation_settings
+    return validity_of(*arguments, assessment_rng(run.config))
+
+
+def checks_of_run(run: Run) -> tuple[Check, ...]:
+    """Checks of a run that has been sampled, or of a fit alone, including its diagnostics."""
+    return in_order((*checks_besides_diagnostics(run), *run.diagnostics.checks))
+
+
+def checks_besides_diagnostics(run: Run) -> tuple[Check, ...]:
+    """Checks of a run that has been sampled, or of a fit alone, in addition to its diagnostics."""
+    catalogue = motions = None
+    if run.kind.has_catalogue:
+        stars = run.catalogue
+        states_errors = stars is not None and stars.sigma_u is not None
+        states_motion_errors = stars is not None and stars.sigma_pm_u is not None
+        catalogue = states_errors or run.config.states_catalogue
+        motions = states_motion_errors or run.config.states_motions
+    return (
+        *run.kind.checks(run),
+        *assumption_checks(
+            run.posterior if run.is_sampled else None,
+            run.diagnostics,
+            run.model.time,
+            catalogue_stated=catalogue,
+            motions_stated=motions,
+        ),
+    )
+
+
+def assessment_rng(config: Config) -> np.random.Generator:
+    """Random number generator of the assessment, in its initial state."""
+    return streams.assessment_rng(config.sampler.seed)
+
+
+def evaluation_settings(run: Run) -> EvaluationSettings:
+    """Settings of the evaluation of errors, including the dates of the stars."""
+    return replace(rehearsal_settings(run), dates=run.dates)
+
+
+def rehearsal_settings(run: Run) -> EvaluationSettings:
+    """Settings of an evaluation without the dates of the stars, which only verdicts mention."""
+    config, measured = run.config, run.kind.measures_centroids
+    return EvaluationSettings(
+        grid=config.assess.grid,
+        epoch=run.epoch,
+        draws=config.assess.draws,
+        years_ahead=config.assess.years_ahead,
+        scale_mas=config.detector.scale_mas,
+        single=config.assess.exposure == "single",
+        # centroid errors estimated by the fit include no other errors
+        contained=() if measured else config.held_in_residuals(run.model.unit),
+        given=config.stated_errors,
+        field=config.field,
+    )
+
+
+def idle_dates(config: Config, requirements: Sequence[Requirement], where: str = "") -> str:
+    """Sentence on dates without effect because the model does not depend on time; empty if none.
+
+    Such dates may document when the data were taken and are therefore not refused. `where` is the
+    file of the requirements if it is not the configuration.
+    """
+    if config.is_dated or config.time() is not None:
+        return ""
+    named = [f"of {r.where}" for r in requirements if r.epoch is not None]
+    if config.assess.epoch is not None and not where:
+        named.insert(0, "assess.epoch")
+    if not named:
+        return ""
+    file = f"{where}: " if where else ""
+    return (
+        f"{file}nothing in the model depends on time, so that the dates given change nothing "
+        f"({', '.join(named)})"
+    )
+
+
+def error_model_of_fit(run: Run) -> ErrorModel:
+    """Error model of the fit alone, without terms derived from residuals."""
+    fit = run.fit
+    terms = run.kind.error_terms(run, fit)
+    scale = pixel_scale_of(fit, scale_mas=run.config.detector.scale_mas)
+    return error_model(fit, terms, pixel_scale=scale)
+
+
+def error_model_of_run(run: Run) -> ErrorModel:
+    """Error model of a posterior, including terms derived from residuals."""
+    posterior, domain = run.posterior, run.kind.domain(run)
+    return diagnosed_error_model(
+        posterior,
+        run.diagnostics,
+        run.kind.error_terms(run, posterior),
+        hierarchy=run.hierarchy,
+        catalogue=run.catalogue_name,
+        aligned=domain.aligned,
+        single=domain.single,
+        frames=domain.frames,
+        structure_left=domain.structure_left,
+        pixel_scale=pixel_scale_of(posterior, scale_mas=run.config.detector.scale_mas),
+    )
 
 
 def product_terms(product: ProductInput, config: Config, base: Path) -> tuple[Known, ...]:

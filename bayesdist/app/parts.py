@@ -1,16 +1,21 @@
-"""Least-squares fit of a run with what it depends on, as files in the folder of the run."""
+"""Fit and parts of a run, as files in its folder.
+
+Parts are results of the matching or the fit that only some kinds of runs have.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Required, TypedDict
+from typing import Any, ClassVar, Required, TypedDict
 
 from astropy.table import Table
 
-from bayesdist.app.artefacts.parts import Part
-from bayesdist.app.artefacts.stars import ErrorLaw
-from bayesdist.app.store.output import write_table
+from bayesdist.app.stars import ErrorLaw
+from bayesdist.app.store.record import write_table
+from bayesdist.data.matches import Matches
+from bayesdist.diagnose.tables import BetweenNodes
 from bayesdist.errors import InputError
 from bayesdist.files.faults import restoring
 from bayesdist.files.records import read_record, write_record
@@ -23,7 +28,12 @@ from bayesdist.infer import (
     save_fit,
 )
 from bayesdist.infer.catalogue.added_errors import GroupedErrors
+from bayesdist.infer.nodes import corrected_matches, on_the_chips
+from bayesdist.model import DistortionModel, LookupTable
 from bayesdist.plugin import packages
+from bayesdist.utils.arrays import Float
+
+TABLES = "tables.h5"
 
 FIT, RECORD, MAGNITUDE_ERRORS = "fit.nc", "fit.h5", "magnitude_errors.ecsv"
 # artefacts of the stage 'fit' by their names in fit.h5, which holds parts as well
@@ -34,6 +44,76 @@ RECORDED = {
     "facts": "fit_facts",
 }
 FIT_AGAIN = "run the stage 'fit' again"
+
+
+class Part:
+    """Result of the matching or the fit that only some kinds of runs have.
+
+    Subclasses override what they contribute; the methods of this class contribute nothing.
+    """
+
+    title: ClassVar[str]  # what a run lacks without it, for errors
+    stage: ClassVar[str] = "fit"  # or "match": the stage that makes it
+    # True for a dataclass of numbers, texts and arrays, which is stored in fit.h5 and restored by
+    # `read_stored_fit`; other parts are written by `save` and read by `load_fit` of their kind
+    recorded: ClassVar[bool] = False
+    is_hierarchy: ClassVar[bool] = False  # exposures scatter about the solution of the fit
+    applies_errors: ClassVar[bool] = False  # stars from `placed` have their errors already
+
+    def save(self, folder: Path) -> None:
+        """Write the part to the folder of a run."""
+
+    def placed(self, stars: Matches, model: DistortionModel) -> Matches:
+        """Stars at the positions that the fit has used."""
+        return stars
+
+    def gauge_sentence(self) -> str:
+        """Sentence that states the gauge of the products; may be empty."""
+        return ""
+
+
+@dataclass(frozen=True, eq=False)
+class StoredLookupTables(Part):
+    """Look-up tables of a run with their errors."""
+
+    title = "look-up tables"
+
+    tables: tuple[LookupTable, ...] = ()  # tables of the detector come first
+    # by chip, (ny, nx, 2): position errors caused by the errors of all tables, in the unit of u, v
+    position_sigma: Mapping[int, Float] = field(default_factory=dict)
+    # by chip, if measured: distortion between the nodes that no table follows
+    between: Mapping[int, BetweenNodes] = field(default_factory=dict)
+
+    def save(self, folder: Path) -> None:
+        """Write the tables to the folder of a run."""
+        write_tables(folder / TABLES, self)
+
+    def placed(self, stars: Matches, model: DistortionModel) -> Matches:
+        """Stars with corrected pixels, without those moved off their chip."""
+        if not self.tables or not stars.in_memory:
+            return stars
+        return on_the_chips(corrected_matches(self.tables, stars), model)
+
+
+def write_tables(path: Path, stored: StoredLookupTables) -> None:
+    """Write look-up tables to a file, or remove the file if there are no tables."""
+    if stored.tables:
+        write_record(path, stored)
+    else:
+        path.unlink(missing_ok=True)
+
+
+NO_TABLES = StoredLookupTables()
+
+
+def read_tables(path: Path, *, do: str) -> StoredLookupTables:
+    """Look-up tables of a file written by `write_tables`; empty if there is no file.
+
+    `do` completes the message of an error: what the user should do.
+    """
+    if not path.exists():
+        return StoredLookupTables()
+    return read_record(path, StoredLookupTables, "a file of look-up tables", do=do)
 
 
 class FitArtefacts(TypedDict, total=False):

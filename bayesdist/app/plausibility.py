@@ -8,7 +8,7 @@ import numpy as np
 from numpy.polynomial import legendre
 
 from bayesdist.app.config import Config
-from bayesdist.app.kinds.sampling import doubts_on_numbers
+from bayesdist.app.kind import doubts_on_numbers
 from bayesdist.app.run import Run
 from bayesdist.data import Matches
 from bayesdist.data.sky import sky_of_plane

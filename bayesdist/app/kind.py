@@ -1,33 +1,43 @@
-"""One kind of run: what differs between matched stars, campaigns and self-calibrations."""
+"""One kind of run: what differs between matched stars, campaigns and self-calibrations.
+
+Kinds share the sampling of fits with stars at given positions, and the further exposures that
+`bayesdist plan` counts.
+"""
 
 from __future__ import annotations
 
+import logging
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, TypeVar
 
 import numpy as np
 
-from bayesdist.app.artefacts.stars import ErrorLaw, RunInput
-from bayesdist.app.artefacts.stored_fit import read_stored_fit
-from bayesdist.app.kinds.further_exposures import FurtherExposures
-from bayesdist.app.kinds.sampling import sample_stars
+from bayesdist.app.parts import read_stored_fit
 from bayesdist.app.run import Run
+from bayesdist.app.stars import ErrorLaw, RunInput
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess.model import with_diagnosed_errors
+from bayesdist.assess.planning import Schedule
+from bayesdist.assess.requirements.requirement import Requirement
 from bayesdist.assess.terms.catalogue import fraction_of_bright
 from bayesdist.assess.terms.forms import ErrorTerm
 from bayesdist.data import MagnitudeErrors, Matches, ReferenceCatalog
+from bayesdist.diagnose import score_tests
 from bayesdist.diagnose.diagnostics import FittedStars
 from bayesdist.diagnose.holdout.predictive import Predictive, predictive_of
 from bayesdist.diagnose.overlap import OverlapTest
-from bayesdist.infer import Posterior
+from bayesdist.errors import DegenerateError
+from bayesdist.infer import Posterior, sample
 from bayesdist.infer.catalogue.star_errors import StarErrors
+from bayesdist.infer.compare.planning import ExposureContent, exposure_information
 from bayesdist.infer.exposures.hierarchy import Settling
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.model import DistortionModel, LookupTable
+from bayesdist.model.basis import n_terms
 from bayesdist.report.run import Terminology
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.checks import Check
@@ -37,6 +47,13 @@ if TYPE_CHECKING:
 
 C = TypeVar("C", contravariant=False)  # configuration
 I = TypeVar("I")  # inputs
+
+LATER = 4  # number of dates that represent evenly spread exposures
+
+log = logging.getLogger("bayesdist")
+
+DISPLACED = ("displaced stars", "two cores")  # tests that find displaced stars, best words first
+STARS_PER_TERM = 3  # fewest stars per term and axis for which residuals show the errors
 
 
 @dataclass(frozen=True)
@@ -285,3 +302,116 @@ class RunKind(ABC, Generic[C, I]):
     def filter(self, run: Run) -> str:
         """Filter of the exposures; empty if it has no name."""
         return ""
+
+
+class FurtherExposures:
+    """Further exposures of a run with a catalogue: each has stars like those of the existing ones.
+
+    `gain` is the information of a further exposure relative to the mean of the existing ones.
+    """
+
+    gain = 1.0
+
+    def __init__(self, run: Run) -> None:
+        self.run = run
+
+    @property
+    def count(self) -> int:
+        """Number of exposures of the run."""
+        return max(len(self.run.placed.exposure_names), 1)
+
+    @property
+    def dateless(self) -> str:
+        """Clause on why dates of further exposures do not matter; empty if they do."""
+        if self.run.solution.model.time is not None:
+            return ""
+        return "does not depend on time, so that the dates of further exposures do not matter"
+
+    def sentence(self, content: ExposureContent) -> str:
+        """Sentence that states which exposures are assumed."""
+        return f"An exposure is taken to hold {content.n_stars:.0f} matched stars as these do."
+
+    def schedules(
+        self, requirement: Requirement, content: ExposureContent, epochs: Sequence[float]
+    ) -> list[Schedule]:
+        """Schedules at relevant dates, or one schedule if dates do not matter."""
+        solution, epoch = self.run.solution, self.run.epoch
+
+        def worth(date: float | None) -> Float:
+            return exposure_information(solution, content, date)
+
+        if solution.model.time is None or epoch is None:
+            return [Schedule("at any date", worth(None))]
+        wanted = requirement.epoch or (requirement.epochs or [epoch])[-1]
+        last = float(np.max(self.run.diagnostics.sample.table.column("epoch")))
+        schedules = [
+            Schedule(f"at {date:.2f}", worth(date), single_date=True)
+            for date in dict.fromkeys([*epochs, wanted])
+        ]
+        if wanted > last:
+            spread = [worth(float(date)) for date in np.linspace(last, wanted, LATER + 1)[1:]]
+            name = f"evenly from {last:.2f} to {wanted:.2f}"
+            schedules.append(Schedule(name, np.sum(spread, axis=0) / len(spread)))
+        return schedules
+
+
+def sample_stars(
+    run: Run,
+    *,
+    folder: Path | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Posterior:
+    """Sample the posterior of a fit; checkpoints are written to `folder`."""
+    config = run.config
+    for text in doubts_on_numbers(run.sample, run.model):
+        log.warning("sample: %s", text)
+    with naming_displaced_stars(run):
+        return sample(
+            run.fit,
+            run.shards,
+            outliers=config.mixture(run.stars.match_radius),
+            priors=run.priors,
+            folder=folder,
+            progress=progress,
+            **config.sampler.model_dump(),
+        )
+
+
+@contextmanager
+def naming_displaced_stars(run: Run) -> Iterator[None]:
+    """Add displaced stars, if the residuals of the fit show any, to a DegenerateError as its cause.
+
+    A part of the stars that is displaced as a whole can be described by a scatter of true matches
+    as well as by one of false matches, so that the posterior has several modes.
+    """
+    try:
+        yield
+    except DegenerateError as error:
+        tests = {
+            test.name: test
+            for test in score_tests(run.sample, run.fit, priors=run.priors)
+            if test.significant
+        }
+        for name in DISPLACED:
+            if name in tests:
+                raise DegenerateError(
+                    f"{error.cause}; a likely cause is that {tests[name].finding}",
+                    where=error.where,
+                    do=tests[name].remedy,
+                ) from error
+        raise
+
+
+def doubts_on_numbers(stars: Matches, model: DistortionModel) -> Iterator[str]:
+    """Sentences about chips with fewer than three stars per polynomial term and axis."""
+    terms = n_terms(model.order)
+    needed = STARS_PER_TERM * terms
+    counts = dict(zip(stars.chip_numbers, np.bincount(stars.chip), strict=False))
+    for chip in model.chips:
+        n_stars = int(counts.get(chip.number, 0))
+        if n_stars < needed:
+            yield (
+                f"chip {chip.name} has {n_stars} stars for {terms} terms on each axis (order "
+                f"{model.order}), and {needed} or more are advisable: the posterior may be far "
+                "from normal and sampling slow; lower model.order, or add stars"
+            )

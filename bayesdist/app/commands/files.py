@@ -1,11 +1,17 @@
-"""Commands on calibrations in files or runs: inspect, apply, convert, compare, monitor."""
+"""Commands on files: inspect, apply, convert, compare, monitor, docs, and simulate camera.
+
+Pages of the documentation are part of the package and need no network.
+"""
 
 from __future__ import annotations
 
+from difflib import get_close_matches
+from pathlib import Path
 from typing import Any
 
 import click
 
+import bayesdist.version
 from bayesdist.app.commands.options import (
     ON_FILES,
     ON_RUNS,
@@ -16,7 +22,14 @@ from bayesdist.app.commands.options import (
     force,
     image_size,
     pixel_scale,
+    seed,
 )
+from bayesdist.errors import InputError
+from bayesdist.files.atomic import atomic_path
+from bayesdist.files.regular import read_text
+
+_PACKAGE = Path(bayesdist.version.__file__).parent
+_FOLDERS = (_PACKAGE / "docs", _PACKAGE.parent / "docs")  # installed, and in the source tree
 
 
 @command(calls=f"{ON_FILES}.inspect:inspect")
@@ -118,7 +131,7 @@ def apply(file: str, table: str, output: str, **options: Any) -> None:
 
         click.echo(apply_to_table(file, table, output, pixel_origin=origin, **options))
         return
-    from bayesdist.app.commands.on_files.sky import sky_to_table
+    from bayesdist.app.commands.on_files.apply import sky_to_table
 
     shared = ("columns", "chip", "filter", "epoch", "size", "force")
     common_options = {key: options.pop(key) for key in shared}
@@ -220,3 +233,68 @@ def monitor() -> None:
     NEW is a table of matches, or a CONFIG.toml, a run or a folder with a config.toml
     that names them.
     """
+
+
+@command()
+@click.argument("page", required=False)
+def docs(page: str | None) -> None:
+    """Show a page of the documentation, or list all pages."""
+    pages = _pages()
+    if page is None:
+        width = max(map(len, pages))
+        for name, path in pages.items():
+            click.echo(f"{name:{width}}  {_title(read_text(path))}")
+        return
+    name = page.removesuffix(".md")
+    if name not in pages:
+        near = get_close_matches(name, pages, n=1)
+        raise InputError(
+            f"the documentation has no page {page!r}",
+            do=f"give {near[0]!r}" if near else "list all pages with 'bayesdist docs'",
+        )
+    click.echo_via_pager(read_text(pages[name]))
+
+
+def _title(text: str) -> str:
+    """First heading of a page, or the title in its front matter."""
+    first = next(line for line in text.splitlines() if line.startswith(("# ", "title:")))
+    return first.removeprefix("title:").strip("#' ")
+
+
+def _pages() -> dict[str, Path]:
+    """Files of the documentation pages by name."""
+    for folder in _FOLDERS:
+        pages = {path.stem: path for path in sorted(folder.glob("*.md"))}
+        if pages:
+            return pages
+    raise InputError("the documentation is not installed", do="install the package again")
+
+
+@command(example="simulate camera -o camera_gaia.csv")
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(),
+    default="camera_gaia.csv",
+    metavar="FILE.csv",
+    help="File to write.",
+)
+@click.option(
+    "--stars", type=click.IntRange(min=1), default=4000, metavar="N", help="Number of stars."
+)
+@seed
+@force
+def camera(output: str, stars: int, seed: int, force: bool) -> None:
+    """Simulate one SExtractor catalogue matched to Gaia, for the quickstart."""
+    import numpy as np
+
+    from bayesdist.simulate import matched_to_gaia
+
+    if Path(output).exists() and not force:
+        raise InputError(
+            "already exists", where=output, do="choose another name, or replace it with --force"
+        )
+    table = matched_to_gaia(stars, np.random.default_rng(seed))
+    with atomic_path(output) as path:
+        table.write(path, format="ascii.csv", overwrite=True)
+    click.echo(f"{output}: {stars} matched stars")

@@ -1,1 +1,0 @@
-"""Diagnosis and evaluation of a run: settings, error terms, checks."""

@@ -1,1 +1,0 @@
-"""Inputs, matching, fitting and sampling for each kind of run."""

@@ -1,1 +1,0 @@
-"""Products for pipelines, and their differences from the solution."""

@@ -1,1 +1,0 @@
-"""Result files: tables, arrays and sections of summary.json."""
