@@ -12,9 +12,10 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bayesdist.calibration.calibration import Calibration, calibration_of_maps
 from bayesdist.calibration.chip_map import ChipMap, fitted_map
@@ -50,7 +51,7 @@ class GbdesParameters:
     @property
     def maps(self) -> dict[str, Int]:
         """Row indices of each map, x before y, by the name of the map."""
-        names = np.asarray(self.table["mapName"]).astype(str)
+        names = _filled(self.table["mapName"], "").astype(str)
         return {str(n): np.flatnonzero(names == n) for n in dict.fromkeys(names)}
 
     def order(self, rows: Int) -> int:
@@ -71,7 +72,7 @@ class GbdesParameters:
                 column = f"{name}_{coordinate}_{p}_cov"
                 if column not in self.table.colnames:
                     return None
-                columns.append(np.asarray(self.table[column], float))
+                columns.append(_filled(self.table[column], np.nan).astype(float))
         return np.stack(columns)
 
     def devices(self, band: str | None) -> dict[int, Int]:
@@ -96,6 +97,11 @@ class GbdesParameters:
         }
 
 
+def _filled(column: Any, missing: float | str) -> NDArray[Any]:
+    """Values of a column; `missing` in place of those that are masked."""
+    return np.asarray(np.ma.filled(np.ma.asarray(column), missing))
+
+
 def _parse(content: Content) -> GbdesParameters | None:
     # with thousands of columns, the column names are far from the end of a Parquet file
     if content.path is None or not all(name.encode() in content.raw for name in _COLUMNS):
@@ -116,14 +122,14 @@ def _findings(found: GbdesParameters) -> Iterator[Finding]:
     table = found.table
     determinants = []
     for name, rows in found.maps.items():
-        axes = [str(v) for v in np.asarray(table["coordinate"])[rows]]
+        axes = [str(v) for v in _filled(table["coordinate"], "")[rows]]
         half = len(rows) // 2
-        numbers = np.asarray(table["coefficientNumber"], int)[rows].tolist()
+        numbers = _filled(table["coefficientNumber"], -1).astype(int)[rows].tolist()
         if axes != ["x"] * half + ["y"] * half or numbers != [*range(half)] * 2:
             yield Finding(
                 "error", name, "coefficients are not in the order x, y, each from 0 upwards"
             )
-        slope = np.asarray(table["parameter"], float)[rows]
+        slope = _filled(table["parameter"], np.nan).astype(float)[rows]
         yield from not_finite(slope, name, "holds parameters that are not finite")
         if half >= 3 and _DEVICE.match(name):
             linear = np.array([slope[1:3], slope[half + 1 : half + 3]])
@@ -142,6 +148,8 @@ def _findings(found: GbdesParameters) -> Iterator[Finding]:
         yield Finding("warning", "MAP_x_n_cov", "columns of the covariance are missing")
     elif cov.shape[0] != cov.shape[1]:
         yield Finding("error", "MAP_x_n_cov", f"the covariance is {cov.shape[0]} x {cov.shape[1]}")
+    elif not np.isfinite(cov).all():
+        yield Finding("error", "MAP_x_n_cov", "some elements are missing or not finite")
     elif not np.allclose(cov, cov.T, rtol=0, atol=_NOT_EVEN * np.abs(cov).max()):
         yield Finding("error", "MAP_x_n_cov", "the covariance is not symmetric")
     elif (np.diag(cov) < 0).any():
@@ -178,7 +186,7 @@ def _calibration(found: GbdesParameters, name: str, choice: Choice) -> Calibrati
         )
     devices = found.devices(choice.filter)
     order = max(1, *(found.order(rows) for rows in devices.values()))
-    values = np.asarray(found.table["parameter"], float)
+    values = _filled(found.table["parameter"], np.nan).astype(float)
     maps, changes, used = {}, [], []
     for number, rows in devices.items():
         maps[number] = _map(values[rows], found.order(rows), order, choice.size, name, number)

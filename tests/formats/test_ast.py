@@ -321,6 +321,20 @@ def test_planted_faults_of_gbdes_are_found(tmp_path, fault):
     assert [f for f in registry.lint(path) if message in f.message]
 
 
+@pytest.mark.parametrize(
+    ("column", "message"),
+    [("parameter", "not finite"), ("r/3/poly_x_0_cov", "missing or not finite"),
+     ("coefficientNumber", "not in the order"), ("coordinate", "not in the order")],
+)  # fmt: skip
+def test_missing_values_of_gbdes_are_not_read_as_zero(tmp_path, column, message):
+    table, *_ = gbdes_table()
+    table = Table(table, masked=True)
+    table[column].mask[0] = True
+    table.write(tmp_path / "masked.ecsv")
+    with pytest.raises(InputError, match=message):
+        registry.read_calibration(tmp_path / "masked.ecsv", size=(4000.0, 4072.0))
+
+
 def test_gbdes_needs_a_size_and_a_band(tmp_path):
     table, *_ = gbdes_table()
     path = tmp_path / "params.ecsv"
