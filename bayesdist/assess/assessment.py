@@ -46,7 +46,7 @@ from bayesdist.infer.posterior.checks import convergence_check
 from bayesdist.model.grid import DEFAULT_GRID
 from bayesdist.utils.checks import Check, in_order
 from bayesdist.utils.quantities import Epoch, Number, Random, takes, value_in, year_of
-from bayesdist.utils.streams import assessment_rng
+from bayesdist.utils.random import assessment_rng
 
 EXPOSURES = ("mean", "single")
 MISSING_TERMS = (

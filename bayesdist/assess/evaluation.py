@@ -38,7 +38,7 @@ from bayesdist.model import Chip
 from bayesdist.model.grid import DEFAULT_GRID, mesh
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.checks import Check, in_order, worst
-from bayesdist.utils.streams import restarted
+from bayesdist.utils.random import restarted
 
 VALIDITY_DRAWS = 1000  # number of draws for each epoch of a validity period
 VALIDITY_EPOCHS = 40  # number of epochs of a validity curve

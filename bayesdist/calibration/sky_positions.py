@@ -29,7 +29,6 @@ from bayesdist.calibration.plane import ARCSEC, SkyPlacement
 from bayesdist.data.sky import plane_axes
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Float, Int
-from bayesdist.utils.matern import correlation_at, drawn_fields
 from bayesdist.utils.quantities import (
     Direction,
     Epoch,
@@ -40,6 +39,7 @@ from bayesdist.utils.quantities import (
     whole_number,
     year_of,
 )
+from bayesdist.utils.random import correlation_at, drawn_fields
 
 if TYPE_CHECKING:
     from astropy.coordinates import SkyCoord

@@ -24,7 +24,7 @@ from bayesdist.data.matches import Matches
 from bayesdist.data.tables.checks import columns_of
 from bayesdist.errors import InputError, required
 from bayesdist.utils.arrays import Bool, Float
-from bayesdist.utils.streams import mixed
+from bayesdist.utils.random import mixed
 
 _STARS_IN_BIN = 200  # stars per magnitude bin
 _MAX_BINS = 40

@@ -60,7 +60,7 @@ from bayesdist.infer.stars.loading import opened
 from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.checks import EITHER, Check, warnings_of
 from bayesdist.utils.quantities import Number, Random, takes, value_in
-from bayesdist.utils.streams import assessment_rng, restarted
+from bayesdist.utils.random import assessment_rng, restarted
 
 Bins = tuple[int, int]
 

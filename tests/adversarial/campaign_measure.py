@@ -20,7 +20,7 @@ from bayesdist.assess.terms.correlated import INTERPOLATION as BETWEEN
 from bayesdist.infer.solution.transforms import reference_gauge, without_frames
 from bayesdist.model import DistortionModel
 from bayesdist.model.grid import grid_pixels, mesh
-from bayesdist.utils.streams import restarted
+from bayesdist.utils.random import restarted
 from tests.app.support import after_stages
 
 from .campaign_truth import ARCSEC, BRIGHT, EPOCH0, FAINT, NEW, TERMS, CampaignTruth

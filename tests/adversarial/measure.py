@@ -23,7 +23,7 @@ from bayesdist.assess import Margin, Requirement
 from bayesdist.assess.domain import field_statistic
 from bayesdist.assess.requirements.verdict import verdict_of
 from bayesdist.model.grid import grid_pixels, mesh
-from bayesdist.utils.streams import restarted
+from bayesdist.utils.random import restarted
 from tests.app.support import after_stages
 
 from . import campaign_measure

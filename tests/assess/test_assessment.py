@@ -21,7 +21,7 @@ from bayesdist.diagnose.diagnostics import diagnose
 from bayesdist.errors import InputError
 from bayesdist.infer import build_model, fit_linear, sample
 from bayesdist.model import Chip, DistortionModel
-from bayesdist.utils.streams import assessment_rng
+from bayesdist.utils.random import assessment_rng
 from bayesdist.utils.text import rounded
 from tests.app.support import CENTRE, SIZE, simulated
 

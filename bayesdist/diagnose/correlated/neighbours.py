@@ -47,7 +47,7 @@ from bayesdist.model import DistortionModel
 from bayesdist.model.basis import polynomial_terms
 from bayesdist.model.grid import cell_index
 from bayesdist.utils.arrays import Float, Int
-from bayesdist.utils.matern import matern
+from bayesdist.utils.random import matern
 
 # of separations, in pixels; the last bin contains the pairs used for comparison
 EDGES = np.array([0.0, 6.0, 12.0, 24.0, 48.0, 96.0])

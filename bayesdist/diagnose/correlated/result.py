@@ -15,7 +15,7 @@ from bayesdist.diagnose.correlated.exposure_fields import ExposureFields
 from bayesdist.diagnose.correlated.functions import StructureFunctions
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.utils.arrays import Float
-from bayesdist.utils.matern import matern
+from bayesdist.utils.random import matern
 
 POINTS = 12  # per axis of a chip, at which sizes are averaged
 PAIRED = 7  # per axis of a chip, positions at which errors of neighbours are compared

@@ -35,7 +35,7 @@ from bayesdist.model.basis import MAX_ORDER
 from bayesdist.model.grid import cell_index
 from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.distributions import chi2_sf, f_sf, norm_sf
-from bayesdist.utils.streams import mixed
+from bayesdist.utils.random import mixed
 from bayesdist.utils.text import p_words
 
 DEFAULT_ORDERS = tuple(range(3, 10))

@@ -11,7 +11,7 @@ from bayesdist.calibration.chip_map import FurtherError
 from bayesdist.diagnose.correlated import Discrepancy, estimate_discrepancy
 from bayesdist.diagnose.correlated.functions import StructureFunctions, legendre_products
 from bayesdist.diagnose.correlated.neighbours import _below
-from bayesdist.utils.matern import correlation_at, drawn_fields, matern
+from bayesdist.utils.random import correlation_at, drawn_fields, matern
 
 from .skies import SIGMA, SIZE, Map, matched, scaled
 

@@ -91,12 +91,12 @@ class Observatory(Generic[Settings]):
         )
 
     def _lint(self, file: DistortionFile) -> list[Finding]:
-        from bayesdist.products.common.asdf.lint import lint_distortion
+        from bayesdist.products.common.asdf.distortion import lint_distortion
 
         return [*self.lint_meta(file.meta), *lint_distortion(file)]
 
     def _describe(self, file: DistortionFile) -> list[str]:
-        from bayesdist.products.common.asdf.lint import describe_distortion
+        from bayesdist.products.common.asdf.distortion import describe_distortion
 
         return describe_distortion(file, self._lint(file))
 
