@@ -48,7 +48,7 @@ from bayesdist.model import corrected
 from bayesdist.model.grid import grid_pixels, mesh
 from bayesdist.products.common.document import Positions, ReadBack, by_calibrations
 from bayesdist.products.registry import read_back
-from bayesdist.utils import streams
+from bayesdist.utils import random
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.checks import Check, in_order
 
@@ -132,7 +132,7 @@ def checks_besides_diagnostics(run: Run) -> tuple[Check, ...]:
 
 def assessment_rng(config: Config) -> np.random.Generator:
     """Random number generator of the assessment, in its initial state."""
-    return streams.assessment_rng(config.sampler.seed)
+    return random.assessment_rng(config.sampler.seed)
 
 
 def evaluation_settings(run: Run) -> EvaluationSettings:
