@@ -52,7 +52,8 @@ LATER = 4  # number of dates that represent evenly spread exposures
 
 log = logging.getLogger("bayesdist")
 
-DISPLACED = ("displaced stars", "two cores")  # tests that find displaced stars, best words first
+# tests that find displaced stars, best words first
+DISPLACED = ("displaced group of stars", "displaced stars", "two cores")
 STARS_PER_TERM = 3  # fewest stars per term and axis for which residuals show the errors
 
 

@@ -15,7 +15,7 @@ from bayesdist.data.sky import sky_of_plane
 from bayesdist.errors import InputError
 from bayesdist.model import DistortionModel, TimeDependence
 from bayesdist.model.basis import MAX_ORDER, n_terms, polynomial_terms
-from bayesdist.utils.arrays import Float, Int
+from bayesdist.utils.arrays import Bool, Float, Int
 
 OFF = 1e3  # factor on the expected scale beyond which u and v are refused
 ODD = 3.0  # factor on the expected scale beyond which there is a warning
@@ -47,6 +47,7 @@ NOISE_FREE = 1e-8  # pixels: smaller scatter is rounding, not measurement
 ON_A_LINE = 1e-6  # largest extent of positions across a line, relative to that along it
 LOW_ORDER = 1.7  # ratio of scatters about two orders above which the lower order is too low
 BEST_ORDER = 1.2  # ratio of scatters below which two orders are equally good
+IN_PEAK = 0.4  # part of the residuals: fewer than those of the larger of two groups of stars
 MOST_STARS = 1500  # used to compare orders
 YEARS = (1950.0, 2100.0)
 
@@ -320,6 +321,11 @@ def _doubts_on_order(stars: Matches, order: int) -> Iterator[str]:
     low, high = (_scatter_about(stars, rows, n) for n in (order, higher[-1]))
     if not low > LOW_ORDER * high > 0:
         return
+    # Where stars are displaced as a whole, the scatter depends on which of them a fit rejects, and
+    # peaks of the residuals do not: terms that a polynomial lacks widen these.
+    widths = [_width_of_peak(stars, rows, n) for n in (order, higher[-1])]
+    if not np.any(widths[0] > LOW_ORDER * widths[1]):
+        return
     tried = ((n, _scatter_about(stars, rows, n)) for n in higher)
     best, lowest = next(trial for trial in tried if trial[1] <= BEST_ORDER * high)
     scale = _scale(stars) or 1.0
@@ -387,12 +393,29 @@ def _scatter_about(table: Matches, rows: Int, order: int) -> float:
     return _robust(_clipped_residuals(table, rows, order, ORDER_ROUNDS))
 
 
+def _width_of_peak(table: Matches, rows: Int, order: int) -> Float:
+    """Length (2,) of the shortest interval with a part `IN_PEAK` of the residuals, along u and v.
+
+    The residuals are those of all rows, also of those that the fit of the polynomial rejects.
+    """
+    residuals = np.sort(_fitted(table, rows, order, ORDER_ROUNDS)[0], axis=0)
+    n = int(IN_PEAK * len(residuals))
+    return np.asarray((residuals[n:] - residuals[: len(residuals) - n]).min(axis=0))
+
+
 def _robust(residuals: Float) -> float:
     return NORMAL * float(np.median(np.abs(residuals)))
 
 
 def _clipped_residuals(table: Matches, rows: Int, order: int, rounds: int) -> Float:
     """Residuals (M, 2) of rows within `CLIP` of a polynomial fitted to these rows."""
+    residuals, used = _fitted(table, rows, order, rounds)
+    # corrected for the degrees of freedom of the fit
+    return np.asarray(residuals[used] * np.sqrt(used.sum() / (used.sum() - n_terms(order))))
+
+
+def _fitted(table: Matches, rows: Int, order: int, rounds: int) -> tuple[Float, Bool]:
+    """Residuals (N, 2) of a polynomial, and mask of those within `CLIP` to which it was fitted."""
     i, j = np.array(polynomial_terms(order)).T
     X, Y = (2 * (z - z.min()) / max(np.ptp(z), 1.0) - 1 for z in (table.x[rows], table.y[rows]))
     basis = legendre.legvander(X, order)[:, i] * legendre.legvander(Y, order)[:, j]
@@ -405,5 +428,4 @@ def _clipped_residuals(table: Matches, rows: Int, order: int, rounds: int) -> Fl
         if (inliers == used).all() or inliers.sum() < 2 * len(i):
             break
         used = inliers
-    # corrected for the degrees of freedom of the fit
-    return np.asarray(residuals[used] * np.sqrt(used.sum() / (used.sum() - len(i))))
+    return np.asarray(residuals), used

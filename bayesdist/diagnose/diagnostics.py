@@ -47,7 +47,7 @@ from bayesdist.diagnose.residuals.stars import (
     star_sample,
     star_sums,
 )
-from bayesdist.diagnose.score.result import ScoreTest
+from bayesdist.diagnose.score.result import DISPLACED_GROUP, ScoreTest
 from bayesdist.diagnose.score.tests import score_tests
 from bayesdist.errors import InputError
 from bayesdist.infer import Compute, GaussianPriors, LinearFit, Posterior, Shards, fit_linear
@@ -193,7 +193,8 @@ class Diagnostics:
             findings.append("exposures that deviate far more than the others")
         if self.majority:
             findings.append("more false than true pairs")
-        return self.chi_square.check(findings), *self.input_checks
+        uncut = replace(self.chi_square, uncut=DISPLACED_GROUP in findings)
+        return uncut.check(findings), *self.input_checks
 
     @property
     def checks(self) -> tuple[Check, ...]:

@@ -104,6 +104,18 @@ def test_false_matches_alone_are_no_order_that_is_too_low(rng, false):
     assert "too low" not in " ".join(doubts(dots(rng, 1, false=false)))
 
 
+@pytest.mark.parametrize("share", [0.15, 1 / 3, 0.5])
+@pytest.mark.parametrize("shift", [0.16, 0.4, 2.0])
+def test_stars_that_are_displaced_as_a_whole_are_no_order_that_is_too_low(share, shift):
+    """By 8 to 100 errors.  A fit of high order may reject them where one of low order does not."""
+    for seed in range(5):
+        rng = np.random.default_rng([23, seed])
+        found = dots(rng, 1, n=800)
+        moved = shift * (rng.random(800) < share)
+        found = replace(found, u=found.u + moved)
+        assert "too low" not in " ".join(doubts(found))
+
+
 @pytest.mark.parametrize("noise", [0.0, 1e-10])
 def test_positions_that_were_computed_are_refused_with_a_way_out(rng, noise):
     """Those of a design on a grid, and those with as few digits as a table has, which are not."""

@@ -71,7 +71,7 @@ def test_every_question_has_a_row_where_the_data_can_be_asked():
     always |= {"repeating pattern"}
     always |= {"noise by position", "noise by magnitude", "noise by axis"}
     always |= {"skewness by position", "skewness of a patch", "correlation by position"}
-    always |= {"shape by position", "displaced stars"}
+    always |= {"shape by position", "displaced stars", "displaced group of stars"}
     always |= {"two cores", "jumps", "rings"}
     assert set(one.tests(1)) == always
     of_fields = {"second order of exposures", "fields of exposures"}

@@ -35,6 +35,7 @@ REST = 4.0  # width of the weights of a robust fit, in units of the scatter
 PASSES = 4  # iterations of a robust fit
 RIDGE = 1e-12  # of normal equations, relative to their mean diagonal
 TINY = 1e-300
+ALL = slice(None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +54,9 @@ class ChipResiduals:
     sigma: float  # typical error per axis, in the unit of u and v
     size: tuple[float, float]  # pixels
     free: float = 1.0  # degrees of freedom of the residuals divided by their number
+    # True if z are displacements divided by `error`, so that the functions are as well, and false
+    # if they are whitened residuals
+    per_error: bool = False
 
     @property
     def n_stars(self) -> int:
@@ -92,7 +96,7 @@ class ChipResiduals:
 
     def without_polynomials(self, order: int) -> ChipResiduals:
         """Residuals minus a robust fit of polynomials up to `order`."""
-        z = _minus_fit(legendre_products(self.X, self.Y, polynomial_terms(order)), self.z)
+        z = _minus_fit(self._functions(order), self.z)
         return replace(self, z=z, free=1.0 - n_terms(order) / self.n_stars)
 
     def without_terms(self, order: int) -> ChipResiduals:
@@ -106,9 +110,13 @@ class ChipResiduals:
                 at = np.flatnonzero(of == k)
                 low = [n for n in (2, 1, 0) if STARS_PER_TERM * n_terms(n) <= len(at)]
                 if low:
-                    F = legendre_products(self.X[at], self.Y[at], polynomial_terms(low[0]))
-                    z[:, at] = _minus_fit(F, z[:, at])
+                    z[:, at] = _minus_fit(self._functions(low[0], at), z[:, at])
         return replace(rest, z=z)
+
+    def _functions(self, order: int, rows: Int | slice = ALL) -> Float:
+        """Polynomials (n, K) up to `order` that are fitted to z."""
+        F = legendre_products(self.X[rows], self.Y[rows], polynomial_terms(order))
+        return F / self.error[rows, None] if self.per_error else F
 
     def in_units_of_scatter(self) -> ChipResiduals:
         """Residuals divided by their scatter, with errors that are larger by the same factor."""
@@ -178,7 +186,7 @@ def _chip_residuals(sample: ScoredSample) -> Iterator[ChipResiduals]:
         variance = sample.variance[:, rows] * (1.0 - leverage[:, rows])
         # rotate to the detector axes; the scale factors of the frames are close to 1
         z = sample.whitened[:, rows] / np.sqrt(1.0 - leverage[:, rows])
-        z = np.einsum("nji,jn->in", _rotations(sample.turn[rows]), z)
+        z = np.einsum("nji,jn->in", rotations(sample.turn[rows]), z)
         yield ChipResiduals(
             sample.model.order,
             rows,
@@ -253,7 +261,7 @@ def legendre_products(X: Float, Y: Float, terms: Sequence[tuple[int, int]]) -> F
     return np.asarray(legendre.legvander(X, i.max())[:, i] * legendre.legvander(Y, j.max())[:, j])
 
 
-def _rotations(turn: Float) -> Float:
+def rotations(turn: Float) -> Float:
     """Rotations (n, 2, 2) nearest to linear maps (n, 2, 2)."""
     angle = np.arctan2(turn[:, 1, 0] - turn[:, 0, 1], turn[:, 0, 0] + turn[:, 1, 1])
     c, s = np.cos(angle), np.sin(angle)

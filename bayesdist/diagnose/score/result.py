@@ -35,6 +35,7 @@ LEAST_LEFT = 0.2  # of what a few functions explain: less than that is left by t
 OF_FIELD = ("orders", "edges", "jumps", "rings", "repeating pattern")
 # polynomials of missing orders resemble these, and follow them in part
 STEEP = ("jumps", "rings", "repeating pattern")
+DISPLACED_GROUP = "displaced group of stars"
 SKEWED = ("displaced stars", "skewness by position", "skewness of a patch")
 OF_NOISE = ("noise by position", "noise by axis")
 OF_EXPOSURES = ("noise by exposure", *OF_NOISE)
@@ -278,13 +279,16 @@ def _causes(significant: Mapping[str, Family], outcomes: Sequence[Outcome]) -> d
 def _remedy(family: Family, causes: Mapping[str, Family]) -> str:
     """Remedy of a finding: that of its cause if there is one, otherwise that of its group.
 
+    A finding that is itself a cause has its own.
+
     `causes` maps the names of significant families, and of their groups, to the families; a group
     is mapped to its last member.
     """
     cause = cause_of((family.name, family.group), causes)
     if cause:
         return _remedy(causes[cause], causes)
-    return causes.get(family.group or family.name, family).remedy
+    name = family.name if family.name in CAUSES else family.group or family.name
+    return causes.get(name, family).remedy
 
 
 def _explanation(one: Outcome, outcomes: Sequence[Outcome]) -> str:
@@ -330,6 +334,11 @@ class Cause:
 # By the name or the group of the finding. If there are several causes, the first one has
 # precedence.
 CAUSES: dict[str, Cause] = {
+    # residuals about two centres end more abruptly than those about a single one
+    DISPLACED_GROUP: Cause(
+        "the displaced group of stars",
+        ("matching", "shape", *OF_FIELD, *OF_NOISE, "noise by magnitude"),
+    ),
     "matching": Cause("the match radius", ("shape", *OF_FIELD, *OF_NOISE)),
     "shape": Cause("the shape of the residuals", (*OF_FIELD, *OF_NOISE, "noise by magnitude")),
     "cut-off positions": Cause("positions that were cut off", OF_FIELD),

@@ -61,6 +61,8 @@ class ChiSquare:
         include.
     radius_doubt : str
         Clause on a stated match radius that no match comes near; empty if there is none.
+    uncut : bool
+        True if tests of the residuals have excluded that the match radius has cut them.
     """
 
     total: float
@@ -69,6 +71,7 @@ class ChiSquare:
     false_matches: bool = False
     catalogue: bool = True
     radius_doubt: str = ""
+    uncut: bool = False
 
     def check(self, findings: Sequence[str] = ()) -> Check:
         """Check that chi-square is about one per degree of freedom.
@@ -103,9 +106,10 @@ class ChiSquare:
                 "posterior accounts for the circle"
             )
         if small:
+            why = "" if self.uncut else "the match radius has cut the residuals, or "
             return (
-                f"chi-square per degree of freedom is {ratio:.2g}: the match radius has cut the "
-                "residuals, or the quoted errors are too large, and with them all uncertainties"
+                f"chi-square per degree of freedom is {ratio:.2g}: {why}the quoted errors are too "
+                "large, and with them all uncertainties"
             )
         if ratio <= CHI2_TOO_LARGE.value:
             return ""

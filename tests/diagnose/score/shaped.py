@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,7 +19,7 @@ CHIP = Chip(1, "A", (SIDE, SIDE), (SIDE / 2, SIDE / 2))
 SIGMA = 0.02  # px
 SHAPE = (
     *("skewness by position", "skewness of a patch", "correlation by position", "two cores"),
-    *("shape by position", "displaced stars"),
+    *("shape by position", "displaced stars", "displaced group of stars"),
 )
 
 Noise = Callable[[np.random.Generator, int], np.ndarray]
@@ -179,3 +181,23 @@ def nominal_within(
     nominal = (true + error)[kept]
     columns = dict(zip(("u_nominal", "v_nominal"), nominal.T, strict=True))
     return matches_of(x[kept], y[kept], uv[kept], sigma, **columns), int((~kept).sum())
+
+
+@dataclass(frozen=True)
+class Described:
+    """Displaced stars as a finding describes them."""
+
+    share: float
+    share_sigma: float
+    shift: np.ndarray  # (2,)
+    shift_sigma: np.ndarray
+
+
+def described(test: ScoreTest) -> Described:
+    """Numbers in the finding of a displaced group of stars."""
+    pair = r"(-?[\d.]+) \+- ([\d.]+)"
+    text = rf"{pair} % of them by {pair} pix along u and {pair} pix along v"
+    found = re.search(text, test.finding)
+    assert found, test.finding
+    share, share_sigma, u, sigma_u, v, sigma_v = map(float, found.groups())
+    return Described(share / 100, share_sigma / 100, np.array([u, v]), np.array([sigma_u, sigma_v]))
