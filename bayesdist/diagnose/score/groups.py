@@ -48,7 +48,7 @@ MIN_STARS = 100
 SEARCH_STARS = 600
 SEARCH_PASSES = 8
 LEAST_GAIN = 3.0
-LEAST_OF_OWN = 3.0  # gain in log-likelihood for which t is fitted
+LEAST_OF_OWN = 3.0  # gain in log-likelihood for which the group has a matrix S of its own
 GROUP_DOF = 8  # of the chi-square distribution that bounds twice the gain; see above
 PASSES = 40
 SCALES = np.array([0.45, 0.7, 1.0, 1.5, 2.4])  # s_k
@@ -117,7 +117,7 @@ def displaced_group(
     """
     residual, covariance = _by_star(sample, chips, terms_up_to)
     n = residual.shape[1]
-    if n < MIN_STARS:
+    if n < MIN_STARS or not np.median((residual**2).sum(axis=0)) > TINY:
         return None
     order = np.random.default_rng(1).permutation(n)[:MAX_STARS]
     possible = [
