@@ -80,11 +80,16 @@ TWO_CORES = replace(
 GROUP_OF_STARS = replace(
     SKEWNESS,
     name=DISPLACED_GROUP,
-    remedy="stars without proper motions, a catalogue that was made from two or has two epochs, or "
-    "exposures and visits without a label make such residuals: give proper motions with their "
-    "errors and both dates, give the exposure of each star and fit frames, or leave out the stars "
-    "that are displaced; neither further terms of the model nor other errors or matches help",
+    remedy="stars without proper motions, a catalogue that was made from two or has two epochs, "
+    "exposures and visits without a label, or blends, ghosts and charge-transfer tails make such "
+    "residuals: give proper motions with their errors and both dates, give the exposure of each "
+    "star and fit frames, or leave out the stars that are displaced; neither further terms of the "
+    "model nor other errors help",
     absent="no group of stars is displaced from the others",
+)
+
+CUT_ELSEWHERE = (
+    "; if matches were cut at a radius about other positions, give these as u_nominal and v_nominal"
 )
 
 # (6,) powers of the Legendre polynomials with which the shape may vary: 1, X, Y, XY, X^2, Y^2
@@ -136,7 +141,7 @@ def shape_tests(sample: ScoredSample, chips: Sequence[ChipResiduals]) -> list[Ou
     group = displaced_group(sample, parts, HIGHER)
     skewness, correlation = _skewness(parts, unit), _correlation(parts, unit)
     tests = (
-        _displaced_group(parts, group, unit),
+        _displaced_group(parts, group, unit, cut=_cut_elsewhere(sample)),
         skewness,
         _apart(parts, unit),
         _patch(parts, unit),
@@ -301,12 +306,18 @@ def _apart(chips: list[ChipResiduals], unit: str) -> Outcome | None:
     return outcome(family, T, dof, dof_residual, p_value, square=square, noise=noise, unit=unit)
 
 
+def _cut_elsewhere(sample: ScoredSample) -> bool:
+    """True if matches may have been cut at a radius about positions that are not given."""
+    return bool(sample.match_radius) and sample.from_nominal is None
+
+
 def _displaced_group(
-    chips: list[ChipResiduals], group: DisplacedGroup | None, unit: str
+    chips: list[ChipResiduals], group: DisplacedGroup | None, unit: str, *, cut: bool
 ) -> Outcome | None:
     """Outcome of the test for a group of stars that is displaced as a whole.
 
-    The size is the rms displacement of all stars from their mean.
+    The size is the rms displacement of all stars from their mean.  Where matches may have been cut
+    at a radius about unknown positions (`cut`), one side of the residuals can be missing.
     """
     if not chips:
         return None
@@ -315,7 +326,8 @@ def _displaced_group(
     smallest = partial(_smallest_group, typical, n)
     if group is None:
         return Outcome(GROUP_OF_STARS, 0.0, GROUP_DOF, None, 1.0, 0.0, smallest, unit)
-    family = replace(GROUP_OF_STARS, present=group.sentence(unit))
+    remedy = GROUP_OF_STARS.remedy + (CUT_ELSEWHERE if cut else "")
+    family = replace(GROUP_OF_STARS, present=group.sentence(unit), remedy=remedy)
     size = np.sqrt(group.share * (1 - group.share)) * group.distance
     return Outcome(
         family,
