@@ -219,7 +219,7 @@ def grouped_errors(
     }
     evidence = {name: float(value[name] - value[ONE]) for name in codes if name != ONE}
     best = max(evidence, key=lambda name: evidence[name])
-    typical = np.median(quoted + states[best].variance.min())
+    typical = _typical(table, quoted + states[best].variance.min())
     spread = np.ptp(states[best].variance) / typical
     if evidence[best] < DECISIVE or np.sqrt(1.0 + spread) < 1.0 + MATERIAL:
         best = ONE
@@ -233,12 +233,18 @@ def _quoted(table: Matches) -> Float:
     return np.stack([table.column("sigma_u"), table.column("sigma_v")]) ** 2
 
 
+def _typical(table: Matches, squares: Float) -> float:
+    """Median of squares (2, N) of stars whose motion is measured; of all stars if none is."""
+    measured = ~table.motion_is_assumed
+    return float(np.median(squares[:, measured] if measured.any() else squares))
+
+
 def _starting_state(table: Matches, fit: LinearFit, quoted: Float, outliers: bool) -> _State:
     """Starting state with a common added variance, from the median residual."""
-    square = residuals_of(fit, table) ** 2
-    core = float(np.median(square)) / 0.4549  # median of a squared standard normal variable
-    variance = max(0.0, core - float(np.median(quoted)))
-    wide = max(WIDER**2 * max(core, float(np.median(quoted))), float(square.sum(axis=0).max()) / 8)
+    square, typical = residuals_of(fit, table) ** 2, _typical(table, quoted)
+    core = _typical(table, square) / 0.4549  # median of a squared standard normal variable
+    variance = max(0.0, core - typical)
+    wide = max(WIDER**2 * max(core, typical), float(square.sum(axis=0).max()) / 8)
     f = FALSE[0] if outliers else 0.0
     return _State(fit, square, f, wide, np.full(1, variance), np.ones(len(table)))
 
@@ -255,13 +261,13 @@ def _maximised(
     """State at the maximum of the restricted likelihood; `code` (2, N) is the group per axis."""
     n_groups = int(code.max()) + 1
     variance = np.full(n_groups, float(np.average(start.variance)))
-    f, wide, square, typical = start.f, start.wide, start.square, float(np.median(quoted))
+    f, wide, square, typical = start.f, start.wide, start.square, _typical(table, quoted)
     fit = start.fit
     for _ in range(TURNS):
         var = quoted + variance[code]
         good = good_probability(square, var, f, wide) if outliers else np.ones(len(table))
         if outliers:
-            f, wide = false_matches(good, square, WIDER**2 * float(np.median(var)))
+            f, wide = false_matches(good, square, WIDER**2 * _typical(table, var))
         before, variance = variance, _maxima(quoted, square, good, code, n_groups)
         var = quoted + variance[code]
         fit, residual = refitted(table, model, var, good, priors)

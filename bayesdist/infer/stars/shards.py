@@ -25,7 +25,7 @@ from bayesdist.data.matches import BatchReader, Matches
 from bayesdist.errors import InputError
 from bayesdist.infer.stars.stars import Stars, prepare
 from bayesdist.model import DistortionModel, Groups, merge_groups
-from bayesdist.utils.arrays import Float, Int
+from bayesdist.utils.arrays import Bool, Float, Int
 from bayesdist.utils.memory import release_memory
 
 P = ParamSpec("P")
@@ -188,8 +188,9 @@ def shard_of(model: DistortionModel, reader: BatchReader, n_total: int) -> tuple
     `n_total` is the number of all stars, of which the survey samples a fraction.
     """
     table = reader.load()
-    stars, _ = prepare(model, table)
-    return stars, survey(stars, table, max(1, n_total // SAMPLE))
+    stars, order = prepare(model, table)
+    measured = ~table.motion_is_assumed[order]
+    return stars, survey(stars, table, max(1, n_total // SAMPLE), measured)
 
 
 def total(parts: Iterable[T]) -> T:
@@ -342,7 +343,10 @@ class Survey:
 
     @property
     def reference_sigma(self) -> float:
-        """Median quoted error per axis, in the unit of u and v; the scale of the priors."""
+        """Median quoted error per axis, in the unit of u and v; the scale of the priors.
+
+        Stars whose motion is assumed are left out.
+        """
         return float(np.sqrt(np.median(np.concatenate(self.variance))))
 
     def check_circle(self, radius: float | None) -> None:
@@ -367,8 +371,15 @@ class Survey:
         return ", ".join(self.sources)
 
 
-def survey(stars: Stars, matches: Matches, every: int) -> Survey:
-    """Survey of a chunk of the data; the errors of every `every`-th star are sampled."""
+def survey(stars: Stars, matches: Matches, every: int, measured: Bool) -> Survey:
+    """Survey of a chunk of the data.
+
+    The errors of every `every`-th star with a measured motion are sampled: those of assumed motions
+    are no scale of the other errors.  `measured` (N,) is in the order of `stars`; if it is True for
+    no star, the errors of all are sampled.
+    """
+    if not measured.any():
+        measured = np.ones(len(stars), bool)
     model = stars.model
     numbers = matches.chip_number
     chips = []
@@ -397,7 +408,7 @@ def survey(stars: Stars, matches: Matches, every: int) -> Survey:
             : len(model.exposures)
         ],
         chips=tuple(chips),
-        variance=tuple(variance[::every].copy() for variance in stars.variances()),
+        variance=tuple(variance[measured][::every] for variance in stars.variances()),
         sources=matches.sources,
         farthest=_farthest(matches),
     )

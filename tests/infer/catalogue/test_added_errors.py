@@ -102,6 +102,22 @@ def test_unequal_axes_have_jitters_of_their_own(sizes):
     assert added.sigma[0, high] ** 2 == pytest.approx(np.ptp(found.variance))
 
 
+def test_unequal_axes_are_found_beside_stars_whose_motion_is_assumed():
+    """60 % have errors of 2 px, beside which the difference of the axes is small."""
+    n, rng = 1500, np.random.default_rng(7)
+    table = stars(7, n, (0.05, 0.15))
+    assumed = rng.random(n) < 0.6
+    more = np.where(assumed, 2.0, 0.0)
+    u, v = (a + more * rng.normal(size=n) for a in (table.u, table.v))
+    sigma = np.hypot(QUOTED, more)
+    table = table.with_columns(u=u, v=v, assumed_motion=assumed.astype(int))
+    found = found_in(table.with_errors((sigma, sigma)))
+    assert found.grouping == "axis"
+    expected = np.array([0.05, 0.15]) ** 2 - QUOTED**2
+    # 600 stars on an axis, with some false ones: the scatter of a variance is 6 %
+    np.testing.assert_allclose(found.variance[0] + QUOTED**2, expected + QUOTED**2, rtol=0.25)
+
+
 @pytest.mark.slow
 @only_in_full("estimates are unbiased")
 def test_stated_errors_are_those_by_which_estimates_scatter():

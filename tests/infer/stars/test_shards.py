@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from dataclasses import replace
 
 import numpy as np
@@ -256,3 +257,21 @@ def test_shards_of_another_model_are_refused():
 def test_a_budget_that_is_no_budget_is_refused(memory):
     with pytest.raises(InputError, match=r"compute\.memory_mb"):
         Compute(memory_mb=memory)
+
+
+def test_the_scale_of_priors_is_that_of_stars_with_a_measured_motion(monkeypatch):
+    """With 60 % of assumed motions, in any order and in several pieces."""
+    rng, n = np.random.default_rng(12), 600
+    assumed = rng.random(n) < 0.6
+    model, matches, _ = simulated(12, n, chips=TWO_CHIPS, frames="shift_rotation", n_exposures=4)
+    sigma = np.where(assumed, 2.0, rng.uniform(0.02, 0.06, n))
+    marked = matches.with_errors((sigma, sigma)).with_columns(assumed_motion=assumed.astype(int))
+    middle = np.sqrt(np.median(sigma[~assumed] ** 2))
+    monkeypatch.setattr(batches, "BATCH", 150)
+    with closing(load(model, marked)) as shards:
+        assert shards.survey.reference_sigma == pytest.approx(middle, rel=1e-9)
+    none = marked.with_columns(assumed_motion=np.ones(n, int))
+    with closing(load(model, none)) as shards:
+        assert shards.survey.reference_sigma == pytest.approx(
+            np.sqrt(np.median(sigma**2)), rel=1e-9
+        )
