@@ -80,7 +80,7 @@ class Questions:
 
 
 @dataclass(frozen=True)
-class EvaluationDomain:
+class EvaluatedExposure:
     """The exposure that errors are evaluated for."""
 
     aligned: bool = False  # shift and rotation of a new exposure are fitted by its user
@@ -216,9 +216,9 @@ class RunKind(ABC, Generic[C, I]):
             out.append(config.catalogue.catalogue().term(dates, bright))
         return [*out, *config.user_terms(solution.model.unit)]
 
-    def domain(self, run: Run) -> EvaluationDomain:
+    def domain(self, run: Run) -> EvaluatedExposure:
         """The exposure that errors are evaluated for."""
-        return EvaluationDomain(single=run.config.assess.exposure == "single")
+        return EvaluatedExposure(single=run.config.assess.exposure == "single")
 
     def null_space(self, run: Run) -> Float | None:
         """Directions of the parameters (D, k) that only the gauge fixes; None if there are none."""

@@ -31,7 +31,7 @@ class Plot:
 
 
 @dataclass(frozen=True)
-class Section:
+class PageSection:
     """Section of a page; `title` and `printed` (shown on paper) may be functions of the results."""
 
     name: str
@@ -92,7 +92,7 @@ class Item:
 class Registry:
     """Figures, tables and data of one kind of page, in sections that are in the page's order."""
 
-    def __init__(self, name: str, sections: Sequence[Section]) -> None:
+    def __init__(self, name: str, sections: Sequence[PageSection]) -> None:
         self.name, self.sections = name, tuple(sections)
         self._entries: list[Entry] = []
         self._inserted: set[str] = set()  # names of sections that plugins have added
@@ -135,7 +135,7 @@ class Registry:
 
         return register
 
-    def insert(self, after: str, *sections: Section) -> None:
+    def insert(self, after: str, *sections: PageSection) -> None:
         """Add sections after the one with the given name.
 
         Those of several plugins follow each other by name, whichever is imported first.
@@ -190,67 +190,67 @@ def needed(value: T | None) -> T:
 REPORT = Registry(
     "report",
     (
-        Section("status", "Status", explained=("report", "Summary")),
-        Section(
+        PageSection("status", "Status", explained=("report", "Summary")),
+        PageSection(
             "holdout",
             "Held-out stars",
             explained=("method", "Held-out stars"),
             groups=("Held-out truth",),
         ),
-        Section(
+        PageSection(
             "data",
             "Data",
             printed=lambda run: run.kind.words.prints_data,
             explained=("your_table", ""),
             groups=("Matching",),
         ),
-        Section(
+        PageSection(
             "fit",
             lambda run: run.kind.words.fit_title,
             explained=("method", "Linear fit"),
             groups=("Score tests", "Fit"),
         ),
-        Section("residuals", "Residuals", explained=("method", "Tests for what a model lacks")),
-        Section(
+        PageSection("residuals", "Residuals", explained=("method", "Tests for what a model lacks")),
+        PageSection(
             "outliers",
             "Outliers",
             printed=False,
             explained=("concepts", "Jitter and membership"),
             groups=("Sampling",),
         ),
-        Section("coefficients", "Coefficients", explained=("method", "Model")),
-        Section(
+        PageSection("coefficients", "Coefficients", explained=("method", "Model")),
+        PageSection(
             "maps",
             "Distortion and its uncertainty over the detector",
             explained=("concepts", "What 68 % means"),
         ),
-        Section(
+        PageSection(
             "previous",
             "Difference from the previous release",
             explained=("report", "Difference from the previous release"),
         ),
-        Section("periods", "Time variation", explained=("wise", ""), groups=("Periods",)),
-        Section(
+        PageSection("periods", "Time variation", explained=("wise", ""), groups=("Periods",)),
+        PageSection(
             "budget",
             "Error budget",
             explained=("method", "Error budget and margins"),
             groups=("Errors", "Assumptions"),
         ),
-        Section(
+        PageSection(
             "margins",
             "Margins",
             empty="No requirement was stated.",
             explained=("method", "What a verdict rests on"),
             groups=("Requirements", "Validity"),
         ),
-        Section(
+        PageSection(
             "products",
             "Products",
             empty="No product was written.",
             explained=("files", ""),
             groups=("Products",),
         ),
-        Section("provenance", "Provenance", explained=("files", "")),
+        PageSection("provenance", "Provenance", explained=("files", "")),
     ),
 )
 

@@ -49,22 +49,22 @@ class Picture:
 
 
 @dataclass(frozen=True)
-class Part:
+class PagePart:
     """A section with its content."""
 
     name: str
     title: str
     tables: tuple[TextTable, ...]
     pictures: tuple[Picture, ...]
-    parts: tuple[Part, ...] = ()  # subsections
+    parts: tuple[PagePart, ...] = ()  # subsections
     empty: str = ""  # text shown instead of tables; empty if there are tables
     printed: bool = True  # True if it is shown on paper
     on_top: tuple[Picture, ...] = ()  # its pictures that are shown at the top of the page
 
 
 def numbered(
-    top: Sequence[Picture], parts: Sequence[Part]
-) -> tuple[tuple[Picture, ...], tuple[Part, ...]]:
+    top: Sequence[Picture], parts: Sequence[PagePart]
+) -> tuple[tuple[Picture, ...], tuple[PagePart, ...]]:
     """Number the figures and tables of a page, pictures at the top first.
 
     The numbers are the same on screen and on paper, where some figures are left out.
@@ -73,7 +73,7 @@ def numbered(
     top = tuple(replace(picture, number=next(figures)) for picture in top)
     by_name = {picture.name: picture for picture in top}
 
-    def in_order(part: Part) -> Part:
+    def in_order(part: PagePart) -> PagePart:
         return replace(
             part,
             tables=tuple(replace(table, number=next(tables)) for table in part.tables),
@@ -85,7 +85,9 @@ def numbered(
     return top, tuple(in_order(part) for part in parts)
 
 
-def parts_of(registry: Registry, results: Any, drawings: Mapping[str, Drawing]) -> tuple[Part, ...]:
+def parts_of(
+    registry: Registry, results: Any, drawings: Mapping[str, Drawing]
+) -> tuple[PagePart, ...]:
     """Sections of a page that have content, or a text for missing content, in registry order.
 
     Figures that are not in `drawings` are left out.
@@ -103,13 +105,13 @@ def parts_of(registry: Registry, results: Any, drawings: Mapping[str, Drawing]) 
             )
             pictures.setdefault(item.section, []).append(picture)
 
-    def within(parent: str) -> Sequence[Part]:
+    def within(parent: str) -> Sequence[PagePart]:
         out = []
         for section in registry.sections:
             if section.parent != parent:
                 continue
             shown = tuple(sorted(tables.get(section.name, ()), key=lambda table: table.folded))
-            part = Part(
+            part = PagePart(
                 section.name,
                 section.title_of(results),
                 shown,
@@ -204,7 +206,7 @@ def _hash(text: str) -> str:
     return f"'sha256-{base64.b64encode(digest).decode('ascii')}'"
 
 
-def _widths(parts: Iterable[Part]) -> list[int]:
+def _widths(parts: Iterable[PagePart]) -> list[int]:
     """Widths of all pictures of some sections, without duplicates."""
     widths: set[int] = set()
     for part in parts:

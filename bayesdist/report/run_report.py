@@ -17,7 +17,7 @@ from markupsafe import Markup
 
 from bayesdist.files.atomic import atomic_path
 from bayesdist.report.drawing import Drawing, draw_all
-from bayesdist.report.page import Part, Picture, numbered, parts_of, template
+from bayesdist.report.page import PagePart, Picture, numbered, parts_of, template
 from bayesdist.report.run import ReportedRun, is_provisional, is_simulated, to_be_drawn
 from bayesdist.report.sections import REPORT
 from bayesdist.report.sections.status import facts_line, verdict
@@ -88,7 +88,7 @@ def _with_strip(contents: dict[str, Any]) -> dict[str, Any]:
     """Move the figures of `STRIP` from their sections to the top, and number all figures."""
     top: dict[str, Picture] = {}
 
-    def without(part: Part) -> Part:
+    def without(part: PagePart) -> PagePart:
         on_top = tuple(p for p in part.pictures if p.name in STRIP)
         top.update({p.name: p for p in on_top})
         remaining_pictures = tuple(p for p in part.pictures if p.name not in STRIP)
@@ -105,7 +105,7 @@ def _contents(run: ReportedRun, drawings: Mapping[str, Drawing]) -> dict[str, An
     """Content of the page."""
     parts = parts_of(REPORT, run, drawings)
     status = next(part for part in parts if part.name == "status")
-    other_parts: list[Part] = [part for part in parts if part is not status]
+    other_parts: list[PagePart] = [part for part in parts if part is not status]
     return {
         "title": run.title,
         "order": run.model.order,

@@ -17,7 +17,7 @@ from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data import read_matches
 from bayesdist.files.tables import read_table
 from bayesdist.infer import load_fit
-from bayesdist.kinds.campaign.linear_terms import ExposuresAlone, ExposureScatter
+from bayesdist.kinds.campaign.linear_terms import ExposuresAlone, LinearTermScatter
 from tests.app.support import (
     carried_out,
     cli,
@@ -125,9 +125,9 @@ def test_functions_find_what_the_run_has_found(run) -> None:
             np.testing.assert_array_equal(getattr(made, name), getattr(read, name))
     assert prepared.held_exposures == opened.held_exposures
     assert len(prepared.held_exposures) == 2
-    alone, scatter = prepared.part(ExposuresAlone).series, prepared.part(ExposureScatter)
+    alone, scatter = prepared.part(ExposuresAlone).series, prepared.part(LinearTermScatter)
     np.testing.assert_array_equal(alone.values, opened.part(ExposuresAlone).series.values)
-    np.testing.assert_array_equal(scatter.tau, opened.part(ExposureScatter).tau)
+    np.testing.assert_array_equal(scatter.tau, opened.part(LinearTermScatter).tau)
 
 
 @pytest.mark.slow

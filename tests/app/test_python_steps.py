@@ -31,7 +31,7 @@ SEED = 2
 STARS = {"smooth_270": 1200, "inside_drift": 900, "cut_at_2.4": 400, "breathing_new_exposure": 1600}
 CASES = [
     "smooth_270",
-    case_in_full("inside_drift", instead="tests/app/test_calibrate has dates"),
+    case_in_full("inside_drift", instead="tests/kinds/matches/test_calibrate has dates"),
     case_in_full("cut_at_2.4", instead="the circle is a check as others are"),
     case_in_full("breathing_new_exposure", instead="a drift has exposures, too"),
 ]

@@ -682,7 +682,7 @@ def measured(small, path):
 
 
 @pytest.mark.slow
-@only_in_full("tests/app/test_at_scale counts rows")
+@only_in_full("tests/kinds/matches/test_at_scale counts rows")
 @pytest.mark.parametrize("group", [10_000, 10_000_000])
 def test_memory_does_not_grow_with_the_table(rng, tmp_path, group):
     """A table of 8 times as many rows, in small row groups or one that holds them all."""

@@ -13,7 +13,6 @@ from astropy.table import Table
 from bayesdist.formats.lookup.tables import write_d2im
 from bayesdist.missions.wise.simulate.bringup import simulate_unpaired
 from bayesdist.products import registry
-from tests.app import layouts
 from tests.app.rvb_jobs import rvb_job, rvb_pairs, write_rvb_table
 from tests.app.support import as_table, good, simulated, write_config, write_job
 from tests.formats.test_ast import gbdes_table
@@ -21,6 +20,7 @@ from tests.formats.test_formats import OPTIONS, SETTINGS, SIZES, calibration_for
 from tests.formats.test_hst1pass import LIST
 from tests.formats.test_lookup_files import table as lookup_table
 from tests.fuzz.settings import CAMPAIGN, MATCHED, REQUIREMENTS
+from tests.kinds.matches import layouts
 from tests.kinds.selfcal.patterns.test_command import SMALL
 from tests.kinds.selfcal.runs.support import commanded, list_table, small, write_selfcal
 from tests.missions.wise.test_bringup import write_lists

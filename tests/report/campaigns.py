@@ -16,10 +16,10 @@ from bayesdist.kinds.campaign.kind import CAMPAIGN
 from bayesdist.kinds.campaign.report.data import (
     CampaignData,
     CatalogStars,
-    ChipResiduals,
-    Detections,
+    DetectionQuality,
     Footprints,
     LinearSeries,
+    TableResiduals,
 )
 from bayesdist.model import LookupTable
 
@@ -156,13 +156,13 @@ def pattern(chip: int, filter: str = "") -> LookupTable:
     return LookupTable(chip, values, filter=filter, sigma=np.full((2, 4, 8), 0.0047 / chip))
 
 
-def residuals_of(chip, seed: int = 4) -> ChipResiduals:
+def residuals_of(chip, seed: int = 4) -> TableResiduals:
     rng = np.random.default_rng([seed, chip.number])
     x, y = (rng.uniform(0.5, s + 0.5, 4000) for s in SIZE)
     noise = 0.016 * rng.standard_normal((4000, 2))
     without = noise + pattern(chip.number).evaluate(x, y)
     binned = [binned_residuals(x, y, *r.T, bins=(8, 4), size=SIZE) for r in (without, noise)]
-    return ChipResiduals(chip, without, noise, *binned)
+    return TableResiduals(chip, without, noise, *binned)
 
 
 def overlap(seed: int = 5) -> OverlapTest:
@@ -207,7 +207,9 @@ def data_of(chips) -> CampaignData:
         filter="F606W",
         matching=matching,
         catalog=CatalogStars(mag, sigma, sigma / 10, (grid, 0.003 + 0 * grid), "pix", 4_964),
-        detections=Detections(mag, 10 * sigma, mag < -10, 98_765, 51_234, (-14.0, -10.0), 0.1),
+        detections=DetectionQuality(
+            mag, 10 * sigma, mag < -10, 98_765, 51_234, (-14.0, -10.0), 0.1
+        ),
         footprints=Footprints(
             rng.uniform(0, 900, 500),
             rng.uniform(0, 900, 500),

@@ -17,7 +17,7 @@ from bayesdist.infer import Posterior
 from bayesdist.kinds.campaign.report.data import CampaignData
 from bayesdist.missions.wise.bands.command import BANDS
 from bayesdist.missions.wise.bands.context import BandsInput
-from bayesdist.report.contents import Plot, Registry, Section
+from bayesdist.report.contents import PageSection, Plot, Registry
 from bayesdist.report.page import parts_of
 from bayesdist.report.run import ReportedRun
 from bayesdist.report.run_report import STRIP, render_report
@@ -82,7 +82,7 @@ def test_the_table_of_figures_in_the_documentation_is_the_registry():
 
 
 def test_two_entries_of_one_name_are_refused():
-    registry = Registry("small", (Section("one", "One"),))
+    registry = Registry("small", (PageSection("one", "One"),))
     registry.figure("one")(lambda r: None)
     with pytest.raises(ValueError, match="two entries"):
         registry.figure("one")(lambda r: None)
@@ -93,10 +93,10 @@ def test_a_page_of_its_own_needs_no_change_elsewhere():
     registry = Registry(
         "small",
         (
-            Section("all", "All"),
-            Section("part", lambda r: r.title, parent="all"),
-            Section("nothing", "Nothing"),
-            Section("missing", "Missing", empty="None was made."),
+            PageSection("all", "All"),
+            PageSection("part", lambda r: r.title, parent="all"),
+            PageSection("nothing", "Nothing"),
+            PageSection("missing", "Missing", empty="None was made."),
         ),
     )
 

@@ -207,14 +207,14 @@ class Tdd(BaseTdd):
     rates: ClassVar[str] = "free"
 
 
-class Polynomials(Section):
+class PolynomialBlock(Section):
     """Order and reference pixel of the polynomials."""
 
     order: Annotated[int, Field(ge=1, le=MAX_ORDER)]
     reference_pixel: Pair | None = None
 
 
-class StructureBlock(Polynomials):
+class StructureBlock(PolynomialBlock):
     """Structure of the distortion model, with the keys that all kinds of runs have."""
 
     if TYPE_CHECKING:

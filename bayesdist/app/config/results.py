@@ -193,7 +193,7 @@ class ReleaseBlock(Section):
     limit_mas: PositiveFloat = 0.1
 
 
-class Products(Section):
+class ProductsBlock(Section):
     """Products for pipelines, and the release that they replace."""
 
     previous: str | None = None  # calibration of any format, or a run
@@ -236,10 +236,10 @@ def _year_of_keyword(text: str) -> float:
     return year_of(date, where="useafter")
 
 
-P = TypeVar("P", bound=Products)
+P = TypeVar("P", bound=ProductsBlock)
 
 
-class SingleProducts(Products):
+class SingleProducts(ProductsBlock):
     """Products of a kind of run that has no releases."""
 
     release: ClassVar[ReleaseBlock | None] = None  # only campaigns have releases

@@ -32,7 +32,7 @@ from bayesdist.app.config.results import (
     BudgetBlock,
     CatalogueBlock,
     MatchedProducts,
-    Products,
+    ProductsBlock,
     RequirementBlock,
 )
 from bayesdist.app.config.section import (
@@ -70,7 +70,7 @@ class RunConfig(Section):
         model: StructureBlock
         outliers: BaseOutliers
         sampler: BaseSampler
-        products: Products
+        products: ProductsBlock
 
         @property
         def tables(self) -> TablesBlock: ...

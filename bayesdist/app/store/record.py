@@ -72,13 +72,13 @@ def versions() -> dict[str, str]:
     return out
 
 
-class _Part(BaseModel):
+class _RecordPart(BaseModel):
     """Part of run.json; strings are not converted to numbers."""
 
     model_config = ConfigDict(strict=True, extra="forbid")
 
 
-class _Head(_Part):
+class _Head(_RecordPart):
     """Entries that every version of the package writes to run.json."""
 
     model_config = ConfigDict(extra="allow")
@@ -86,7 +86,7 @@ class _Head(_Part):
     versions: dict[str, str] = Field(default_factory=dict)
 
 
-class FileMark(_Part):
+class FileMark(_RecordPart):
     """Size and SHA-256 of a file when it was written."""
 
     size: Annotated[int, Field(ge=0)]
@@ -116,7 +116,7 @@ def _as_ingredients(raw: dict[str, Any]) -> dict[str, Any]:
     return raw
 
 
-class Artefact(_Part):
+class Artefact(_RecordPart):
     """Ingredients of a stage, and the files that it wrote.
 
     Parameters
@@ -143,17 +143,17 @@ class Artefact(_Part):
         return digest_of([written, self.sections] if written or self.sections else self.parts)
 
 
-class _StageNote(_Part):
+class _StageNote(_RecordPart):
     wall_s: float
     ended: str
 
 
-class _UnderWay(_Part):
+class _UnderWay(_RecordPart):
     stage: str
     files: list[str]
 
 
-class _Whole(_Head):
+class _RecordFile(_Head):
     """Content of run.json."""
 
     sha256: str
@@ -172,7 +172,7 @@ class _Whole(_Head):
     requirements: list[dict[str, Any]] = Field(default_factory=list)
 
 
-_HEAD, _WHOLE = TypeAdapter(_Head), TypeAdapter(_Whole)
+_HEAD, _WHOLE = TypeAdapter(_Head), TypeAdapter(_RecordFile)
 
 
 @dataclass

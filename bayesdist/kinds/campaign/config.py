@@ -19,7 +19,7 @@ from bayesdist.app.config.fit import (
     StructureBlock,
     TablesBlock,
 )
-from bayesdist.app.config.results import Products, ReleaseBlock, with_formats
+from bayesdist.app.config.results import ProductsBlock, ReleaseBlock, with_formats
 from bayesdist.app.config.run import FREE, RunConfig, rates_file, tables_file
 from bayesdist.app.config.section import Epoch, Unit
 from bayesdist.kinds.star_lists import StarListsBlock
@@ -70,7 +70,7 @@ class CampaignOutliers(MixtureOutliers):
 
 
 @with_formats()
-class CampaignProducts(Products):
+class CampaignProducts(ProductsBlock):
     """Products of a campaign, with a release for several filters."""
 
     release: ReleaseBlock | None = None

@@ -45,11 +45,11 @@ from bayesdist.infer.nodes import (
 )
 from bayesdist.infer.solution.linear import Rejection
 from bayesdist.kinds.campaign.config import CampaignConfig
-from bayesdist.kinds.campaign.inputs import Inputs, frames_not_set
+from bayesdist.kinds.campaign.inputs import CampaignInputs, frames_not_set
 from bayesdist.kinds.campaign.linear_terms import (
     FIXED,
     ExposuresAlone,
-    ExposureScatter,
+    LinearTermScatter,
     gap_priors,
     held_tables,
     line_sections,
@@ -78,7 +78,7 @@ def fit_campaign(run: Run) -> Run:
         return run.having(**_fitted(run.stars, run.inputs))
 
 
-def _fitted(pairs: Matches, inputs: Inputs) -> FitArtefacts:
+def _fitted(pairs: Matches, inputs: CampaignInputs) -> FitArtefacts:
     """Artefacts of the stage 'fit'."""
     config = inputs.config
     affine = affine_model_of(config, pairs)
@@ -108,7 +108,7 @@ def _fitted(pairs: Matches, inputs: Inputs) -> FitArtefacts:
         "priors": joint.priors,
         "parts": {
             "tables": tables,
-            "scatter": ExposureScatter(joint.scatter.kinds, joint.tau_draws, joint.settling),
+            "scatter": LinearTermScatter(joint.scatter.kinds, joint.tau_draws, joint.settling),
             "alone": ExposuresAlone(_series(alone, joint.model.chips[0])),
         },
         "fit_facts": facts,
@@ -116,7 +116,7 @@ def _fitted(pairs: Matches, inputs: Inputs) -> FitArtefacts:
 
 
 def _joint(
-    stars: Matches, affine: DistortionModel, inputs: Inputs, rejection: Rejection
+    stars: Matches, affine: DistortionModel, inputs: CampaignInputs, rejection: Rejection
 ) -> HierarchicalFit:
     """Fit all exposures jointly; they deviate from the model by the scatter that is found."""
     config = inputs.config
@@ -168,7 +168,7 @@ def _trends(joint: HierarchicalFit, stars: Matches) -> list[str]:
     ]
 
 
-def refuse_outrun_stars(inputs: Inputs, fit: LinearFit, pairs: Matches) -> None:
+def refuse_outrun_stars(inputs: CampaignInputs, fit: LinearFit, pairs: Matches) -> None:
     """Refuse a catalogue without proper motions if residuals grow with the time from its epoch.
 
     The mean square residual of moving stars is a parabola in time.
@@ -205,7 +205,9 @@ log = logging.getLogger("bayesdist")
 ROUGH_ITERATIONS = 1  # iterations of the tables that are used only to estimate star errors
 
 
-def fit_tables(pairs: Matches, inputs: Inputs) -> tuple[StoredLookupTables, TableFit | None]:
+def fit_tables(
+    pairs: Matches, inputs: CampaignInputs
+) -> tuple[StoredLookupTables, TableFit | None]:
     """Fit the configured look-up tables, and combine them with those held fixed.
 
     The tables of the detector are fitted unless they are taken from another run, in which case the
@@ -265,7 +267,7 @@ def fit_tables(pairs: Matches, inputs: Inputs) -> tuple[StoredLookupTables, Tabl
     return _stored(table_fit.tables, of_nodes, between), table_fit
 
 
-def errors_with_catalogue(pairs: Matches, inputs: Inputs) -> ErrorLaw:
+def errors_with_catalogue(pairs: Matches, inputs: CampaignInputs) -> ErrorLaw:
     """Centroid errors by magnitude, which are added to each star's error of the catalogue.
 
     Each exposure is fitted by itself (`fit_by_magnitude`), and the errors of the catalogue are
@@ -279,7 +281,7 @@ def errors_with_catalogue(pairs: Matches, inputs: Inputs) -> ErrorLaw:
 
 
 def _with_errors(
-    pairs: Matches, inputs: Inputs, held: tuple[LookupTable, ...]
+    pairs: Matches, inputs: CampaignInputs, held: tuple[LookupTable, ...]
 ) -> tuple[Matches, TableFit]:
     """Pairs with errors by magnitude that exclude the table pattern, and a rough fit of the tables.
 
@@ -470,7 +472,7 @@ def fit_new_exposures(release: Run, new: Path) -> tuple[Matches, NewFit, tuple[s
         errors = load_errors(run.path).by_magnitude or errors
     if placed.mag is not None and errors is not None:
         placed = placed.with_errors(errors, in_quadrature=True)
-    scatter = release.part(ExposureScatter)
+    scatter = release.part(LinearTermScatter)
     new_fit = fit_new(
         released,
         placed,

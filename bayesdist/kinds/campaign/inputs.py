@@ -48,7 +48,7 @@ YEARS_AT_REST = 1.0  # years over which proper motions may be neglected
 
 
 @dataclass(frozen=True, eq=False)
-class Inputs:
+class CampaignInputs:
     """Catalogue, exposures and star lists of a campaign."""
 
     config: CampaignConfig
@@ -88,7 +88,7 @@ class Inputs:
         return self.log.filters[0]
 
 
-def outline_of_campaign(inputs: Inputs) -> Outline:
+def outline_of_campaign(inputs: CampaignInputs) -> Outline:
     """Shape of the solution, including fitted look-up tables and those held fixed."""
     config = inputs.config
     chips, block = config.chips(), config.tables
@@ -104,7 +104,7 @@ def outline_of_campaign(inputs: Inputs) -> Outline:
     return Outline(model, inputs.pixel_arcsec / inputs.unit_arcsec, inputs.filter, tables)
 
 
-def read_campaign(config: CampaignConfig, base: Path) -> Inputs:
+def read_campaign(config: CampaignConfig, base: Path) -> CampaignInputs:
     """Read the catalogue, the exposure log and the star lists."""
     block = config.campaign
     whole_log = read_exposures(base / block.exposures)
@@ -122,7 +122,7 @@ def read_campaign(config: CampaignConfig, base: Path) -> Inputs:
         )
     unlogged = dict.fromkeys(name for name in all_lists.names if name not in whole_log)
     reliable = block.pm_selection == "reliable" and full_catalog.sigma_pm_u is not None
-    return Inputs(
+    return CampaignInputs(
         config,
         base,
         full_catalog,
@@ -278,7 +278,7 @@ def errors_by_star(
     return replace(errors, parallax=sigmas[:, 4], factors=factors)
 
 
-def refuse_campaign(inputs: Inputs) -> None:
+def refuse_campaign(inputs: CampaignInputs) -> None:
     """Refuse inconsistent inputs, and files of other runs or products that cannot be used."""
     config, base = inputs.config, inputs.base
     refuse_unsound(inputs)
@@ -288,7 +288,7 @@ def refuse_campaign(inputs: Inputs) -> None:
         open_document(base / config.products.release.reference)
 
 
-def refuse_unsound(inputs: Inputs) -> None:
+def refuse_unsound(inputs: CampaignInputs) -> None:
     """Refuse exposures, lists or a catalogue that cannot be used; stars are not matched."""
     config, lists = inputs.config, inputs.star_lists
     refuse_other_chips(lists.lists, config.chips(), "campaign.lists")
@@ -314,7 +314,7 @@ def refuse_unsound(inputs: Inputs) -> None:
         refuse_strangers(held.exposures, inputs.log.names, inputs.log.source)
 
 
-def input_warnings(inputs: Inputs) -> list[str]:
+def input_warnings(inputs: CampaignInputs) -> list[str]:
     """Clauses that warn about quantities that a campaign cannot determine or has to assume."""
     config, log, catalog = inputs.config, inputs.log, inputs.catalog
     out = []

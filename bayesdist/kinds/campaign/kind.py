@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bayesdist.app.kind import EvaluationDomain, Outline, Questions, RunKind, sample_stars
+from bayesdist.app.kind import EvaluatedExposure, Outline, Questions, RunKind, sample_stars
 from bayesdist.app.parts import TABLES, read_stored_fit, read_tables
 from bayesdist.app.run import Run
 from bayesdist.assess.model import with_diagnosed_errors
@@ -26,14 +26,14 @@ from bayesdist.infer.solution.solution import Solution
 from bayesdist.kinds.campaign.config import CampaignConfig
 from bayesdist.kinds.campaign.fit import fit_campaign
 from bayesdist.kinds.campaign.inputs import (
-    Inputs,
+    CampaignInputs,
     errors_by_star,
     outline_of_campaign,
     read_campaign,
     refuse_campaign,
 )
 from bayesdist.kinds.campaign.linear_terms import (
-    ExposureScatter,
+    LinearTermScatter,
     line_sections,
     write_series_tables,
 )
@@ -79,30 +79,30 @@ WARNING = {
 }
 
 
-class CampaignKind(RunKind[CampaignConfig, Inputs]):
+class CampaignKind(RunKind[CampaignConfig, CampaignInputs]):
     """Star lists, which are matched to a reference catalogue; exposures are fitted jointly."""
 
     words = PAIRED
     section = "matching"
     along_detector = True
 
-    def read(self, config: CampaignConfig, base: Path) -> Inputs:
+    def read(self, config: CampaignConfig, base: Path) -> CampaignInputs:
         """Catalogue, exposure log and star lists."""
         return read_campaign(config, base)
 
-    def refuse(self, inputs: Inputs) -> None:
+    def refuse(self, inputs: CampaignInputs) -> None:
         """Refuse inconsistent inputs, and files of other runs that cannot be used."""
         refuse_campaign(inputs)
 
-    def lines(self, inputs: Inputs) -> Iterator[str]:
+    def lines(self, inputs: CampaignInputs) -> Iterator[str]:
         """Lines about the inputs, dates and roll angles."""
         return campaign_lines(inputs)
 
-    def outline(self, inputs: Inputs) -> Outline:
+    def outline(self, inputs: CampaignInputs) -> Outline:
         """Shape of the solution, with its look-up tables."""
         return outline_of_campaign(inputs)
 
-    def with_config(self, inputs: Inputs, config: CampaignConfig) -> Inputs:
+    def with_config(self, inputs: CampaignInputs, config: CampaignConfig) -> CampaignInputs:
         """Inputs for another configuration, which differs in the model only."""
         return replace(inputs, config=config)
 
@@ -143,7 +143,7 @@ class CampaignKind(RunKind[CampaignConfig, Inputs]):
         """Posterior in which each chip has its mean position over the exposures."""
         posterior = sample_stars(run, folder=folder, progress=progress)
         rng = np.random.default_rng([run.config.sampler.seed, SAMPLING])
-        return run.part(ExposureScatter).averaged(posterior, rng)
+        return run.part(LinearTermScatter).averaged(posterior, rng)
 
     def questions(self, run: Run) -> Questions:
         """Structure is tested if no tables were fitted; their errors are in the budget."""
@@ -151,7 +151,7 @@ class CampaignKind(RunKind[CampaignConfig, Inputs]):
             centroid=run.errors.by_magnitude,
             structure=run.config.tables.method == "none",
             exposures=False,
-            settling=run.part(ExposureScatter).offsets,
+            settling=run.part(LinearTermScatter).offsets,
         )
 
     def overlap(self, run: Run) -> OverlapTest | None:
@@ -164,7 +164,7 @@ class CampaignKind(RunKind[CampaignConfig, Inputs]):
 
     def predictive(self, run: Run) -> Predictive:
         """Prediction with the scatter of exposures, and errors of catalogue and tables."""
-        scatter, settings = run.part(ExposureScatter), run.evaluation_settings
+        scatter, settings = run.part(LinearTermScatter), run.evaluation_settings
         cell, tables = None, run.tables.tables
         if tables:
             across, up = tables[0].step
@@ -182,7 +182,7 @@ class CampaignKind(RunKind[CampaignConfig, Inputs]):
 
         The deviation is the measured scatter, which includes velocity aberration.
         """
-        scatter, config = run.part(ExposureScatter), run.config
+        scatter, config = run.part(LinearTermScatter), run.config
         deviation = ExposureVariation(
             solution.model,
             np.asarray(solution.mean, float),
@@ -194,9 +194,9 @@ class CampaignKind(RunKind[CampaignConfig, Inputs]):
         tables = _table_terms(run, solution)
         return [deviation, *config.linear_terms(solution), *tables, *stated]
 
-    def domain(self, run: Run) -> EvaluationDomain:
+    def domain(self, run: Run) -> EvaluatedExposure:
         """A new exposure, whose user fits shift and rotation."""
-        return EvaluationDomain(aligned=True, structure_left=not run.tables.position_sigma)
+        return EvaluatedExposure(aligned=True, structure_left=not run.tables.position_sigma)
 
     def checks(self, run: Run) -> tuple[Check, ...]:
         """Checks of matching, look-up tables and exposures."""
@@ -231,18 +231,18 @@ class CampaignKind(RunKind[CampaignConfig, Inputs]):
 
     def catalogue(self, run: Run) -> ReferenceCatalog:
         """Reference catalogue with the stars that are used."""
-        inputs: Inputs = run.inputs
+        inputs: CampaignInputs = run.inputs
         return inputs.catalog
 
     def star_errors(self, run: Run) -> StarErrors | None:
         """Errors of the catalogue by star code, along u and v; None if there are none."""
-        inputs: Inputs = run.inputs
+        inputs: CampaignInputs = run.inputs
         mirrored = is_mirrored(run.match_facts)
         return errors_by_star(inputs.catalog, inputs.largest_vafactor, mirrored=mirrored)
 
     def filter(self, run: Run) -> str:
         """Filter of the exposures."""
-        inputs: Inputs = run.inputs
+        inputs: CampaignInputs = run.inputs
         return inputs.filter
 
 

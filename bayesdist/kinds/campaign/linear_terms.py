@@ -112,7 +112,7 @@ def _lines(view: TransformedSolution) -> list[dict[str, object]]:
 
 
 @dataclass(frozen=True, eq=False)
-class ExposureScatter(Part):
+class LinearTermScatter(Part):
     """Scatter of the linear terms of the exposures about those of the model.
 
     Parameters

@@ -35,7 +35,7 @@ from bayesdist.infer.solution.geometry import geometry_of
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.kinds.campaign.config import CampaignConfig
 from bayesdist.kinds.campaign.inputs import (
-    Inputs,
+    CampaignInputs,
     input_warnings,
     parities_of,
     refuse_few,
@@ -60,7 +60,7 @@ GAUGE_EXPOSURES = 1  # leading exposures that define the gauge and cannot be hel
 
 def match_lists(run: Run) -> Run:
     """Match star lists with a catalogue, exposure by exposure."""
-    inputs: Inputs = run.inputs
+    inputs: CampaignInputs = run.inputs
     config, block, lists = inputs.config, inputs.config.campaign, inputs.star_lists
     document = open_document(inputs.base / block.initial_distortion)
     initial = known_calibration(document, block.filter, config.detector.size)
@@ -112,7 +112,7 @@ def _table(found: CampaignMatches, exposures: ExposureLog) -> Table:
 
 
 def _facts(
-    found: CampaignMatches, table: Table, inputs: Inputs, warnings: list[str]
+    found: CampaignMatches, table: Table, inputs: CampaignInputs, warnings: list[str]
 ) -> dict[str, Any]:
     """Section 'matching' of summary.json."""
     false = np.sum(table["false_fraction"] * table["matched"]) / table["matched"].sum()
@@ -208,7 +208,7 @@ def _refuse_bare(pairs: Matches, chips: tuple[Chip, ...], where: str) -> None:
             )
 
 
-def campaign_lines(inputs: Inputs) -> Iterator[str]:
+def campaign_lines(inputs: CampaignInputs) -> Iterator[str]:
     """Lines of text about the inputs, dates and roll angles of a campaign."""
     config, log, catalog, lists = inputs.config, inputs.log, inputs.catalog, inputs.star_lists
     epochs, rolls = log.values("epoch"), log.values("pa_v3")
@@ -250,7 +250,7 @@ def _rolls(rolls: np.ndarray) -> str:
     return f"{angles.min():.1f} to {angles.max():.1f} degrees"
 
 
-def _without(inputs: Inputs) -> dict[int, list[str]]:
+def _without(inputs: CampaignInputs) -> dict[int, list[str]]:
     """Exposures without usable detections on a chip, by chip number."""
     lists, out = inputs.star_lists, dict[int, list[str]]()
     for name, detections, good in zip(lists.names, lists.lists, lists.passed, strict=True):
@@ -290,7 +290,7 @@ def with_pairs(
     table : Table, optional
         One row per exposure.
     """
-    inputs: Inputs = run.inputs
+    inputs: CampaignInputs = run.inputs
     pairs = pairs.named_below(str(inputs.base))
     stars, held, exposures = set_aside(inputs.config, pairs, GAUGE_EXPOSURES)
     return run.having(
@@ -320,7 +320,7 @@ def affine_model_of(config: CampaignConfig, stars: Matches) -> DistortionModel:
 
 def load_matched_campaign(run: Run) -> Run:
     """Run with the matches of an earlier stage, from its folder."""
-    inputs: Inputs = run.inputs
+    inputs: CampaignInputs = run.inputs
     pairs = read_matches(run.directory / PAIRS, unit=inputs.catalog.unit)
     # stored with the diagnostics, which do not say in which folder the run is
     pairs = replace(pairs, sources=tuple(f"{PAIRS}/{Path(name).name}" for name in pairs.sources))
@@ -337,7 +337,7 @@ def is_mirrored(facts: Mapping[str, Any]) -> bool:
 
 def overlap_of(run: Run) -> OverlapTest | None:
     """Comparison of two exposures far apart in time; None if there is no such pair."""
-    inputs: Inputs = run.inputs
+    inputs: CampaignInputs = run.inputs
     block = inputs.config.campaign
     initial = open_document(inputs.base / block.initial_distortion)
     return overlap_test(
@@ -373,7 +373,7 @@ def scale_error(exptime: float | None) -> float:
 
 
 def aberration_term(
-    kinds: Sequence[str], tau: Float, inputs: Inputs, solution: Solution
+    kinds: Sequence[str], tau: Float, inputs: CampaignInputs, solution: Solution
 ) -> ScaleError:
     """Scale error by residual velocity aberration, limited to the measured scatter in scale.
 

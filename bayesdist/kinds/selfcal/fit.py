@@ -45,7 +45,7 @@ from bayesdist.kinds.selfcal.infer import (
 from bayesdist.kinds.selfcal.infer.elimination import Mixture, one_cluster
 from bayesdist.kinds.selfcal.infer.gauge import Decision
 from bayesdist.kinds.selfcal.infer.mode import gauge_of, mode_at, solve_in_gauge
-from bayesdist.kinds.selfcal.inputs import Inputs
+from bayesdist.kinds.selfcal.inputs import SelfcalInputs
 from bayesdist.kinds.selfcal.matching import (
     FirstSolution,
     magnitude_errors_of,
@@ -106,7 +106,7 @@ def solved_of(
 
     The fit itself uses the restored solution, so that later stages obtain the same one.
     """
-    inputs: Inputs = run.inputs
+    inputs: SelfcalInputs = run.inputs
     first, held = run.part(FirstSolution), arrays["held"].astype(np.int64)
     theta, stars = arrays["theta"], arrays["stars"]
     jitter, fraction = (float(v) for v in arrays["mixture"])
@@ -144,7 +144,7 @@ def solved_of(
 
 def fit_selfcal(run: Run) -> Run:
     """Find mode and gauge of a self-calibration together."""
-    inputs: Inputs = run.inputs
+    inputs: SelfcalInputs = run.inputs
     first = run.part(FirstSolution)
     model = first.problem.model
     with one_cluster(inputs.config.resources()) as compute:

@@ -50,7 +50,7 @@ log = logging.getLogger("bayesdist")
 
 
 @dataclass(frozen=True, eq=False)
-class Inputs:
+class SelfcalInputs:
     """Detections, and additional information about exposures and stars."""
 
     config: SelfcalConfig
@@ -150,7 +150,7 @@ class Inputs:
         return replace(problem, priors=references(problem, first))
 
 
-def read_selfcal(config: SelfcalConfig, base: Path) -> Inputs:
+def read_selfcal(config: SelfcalConfig, base: Path) -> SelfcalInputs:
     """Read all inputs of a self-calibration; paths are relative to `base`."""
     block, gauge = config.selfcal, config.gauge
     star_lists = lists_of(block, base, errors=block.sigma == "columns")
@@ -189,7 +189,7 @@ def read_selfcal(config: SelfcalConfig, base: Path) -> Inputs:
         commanded = read_commanded(
             base / gauge.offsets, names, block.unit, config.detector.scale_mas, gauge.offset_sigma
         )
-    return Inputs(
+    return SelfcalInputs(
         config,
         base,
         detections_of(used, epoch=epoch, sigma=sigma),
@@ -201,13 +201,13 @@ def read_selfcal(config: SelfcalConfig, base: Path) -> Inputs:
     )
 
 
-def refuse_selfcal(inputs: Inputs) -> None:
+def refuse_selfcal(inputs: SelfcalInputs) -> None:
     """Refuse exposures that cannot be aligned, and an initial distortion that cannot be read."""
     model, _ = inputs.start
     inputs.known_for(model)
 
 
-def outline_of_selfcal(inputs: Inputs) -> Outline:
+def outline_of_selfcal(inputs: SelfcalInputs) -> Outline:
     """Shape of the solution, from the initial model."""
     model, theta = inputs.start
     plain = DistortionModel(model.order, model.chips, model.unit, model.time)

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bayesdist.app.kind import EvaluationDomain, FurtherExposures, Outline, Questions, RunKind
+from bayesdist.app.kind import EvaluatedExposure, FurtherExposures, Outline, Questions, RunKind
 from bayesdist.app.run import Run
 from bayesdist.app.store.record import provenance_notes
 from bayesdist.assess.planning import Schedule
@@ -19,7 +19,7 @@ from bayesdist.kinds.selfcal.config import SelfcalConfig
 from bayesdist.kinds.selfcal.fit import SelfCalibrated, fit_selfcal, load_selfcal, sample_detections
 from bayesdist.kinds.selfcal.infer import SelfCalibrationMode
 from bayesdist.kinds.selfcal.inputs import (
-    Inputs,
+    SelfcalInputs,
     outline_of_selfcal,
     read_selfcal,
     refuse_selfcal,
@@ -54,7 +54,7 @@ DETECTED = Terminology(
 )
 
 
-class SelfcalKind(RunKind[SelfcalConfig, Inputs]):
+class SelfcalKind(RunKind[SelfcalConfig, SelfcalInputs]):
     """Star lists of dithered exposures; the positions of the stars are fitted as well."""
 
     section = "selfcal"
@@ -68,23 +68,23 @@ class SelfcalKind(RunKind[SelfcalConfig, Inputs]):
         "that is held out shows it"
     )
 
-    def read(self, config: SelfcalConfig, base: Path) -> Inputs:
+    def read(self, config: SelfcalConfig, base: Path) -> SelfcalInputs:
         """Detections, and additional constraints."""
         return read_selfcal(config, base)
 
-    def refuse(self, inputs: Inputs) -> None:
+    def refuse(self, inputs: SelfcalInputs) -> None:
         """Refuse exposures that cannot be aligned, and an unreadable initial distortion."""
         refuse_selfcal(inputs)
 
-    def lines(self, inputs: Inputs) -> Iterator[str]:
+    def lines(self, inputs: SelfcalInputs) -> Iterator[str]:
         """Lines about stars and free directions."""
         return selfcal_lines(inputs)
 
-    def outline(self, inputs: Inputs) -> Outline:
+    def outline(self, inputs: SelfcalInputs) -> Outline:
         """Shape of the solution, from the initial model."""
         return outline_of_selfcal(inputs)
 
-    def with_config(self, inputs: Inputs, config: SelfcalConfig) -> Inputs:
+    def with_config(self, inputs: SelfcalInputs, config: SelfcalConfig) -> SelfcalInputs:
         """Inputs for another configuration, which differs in the model only."""
         return replace(inputs, config=config)
 
@@ -139,7 +139,7 @@ class SelfcalKind(RunKind[SelfcalConfig, Inputs]):
         stars = write_stars(directory.path, solved, correlated, notes, compute)
         directory.summarise(selfcal=directory.summary.get("selfcal", {}) | {"stars": stars})
 
-    def domain(self, run: Run) -> EvaluationDomain:
+    def domain(self, run: Run) -> EvaluatedExposure:
         """As of matched stars; exposures overlap partly, which correlates frames with errors."""
         return replace(super().domain(run), frames=True)
 

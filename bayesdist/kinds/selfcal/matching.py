@@ -35,7 +35,7 @@ from bayesdist.kinds.selfcal.infer.calibrate import scatter_by_magnitude, self_c
 from bayesdist.kinds.selfcal.infer.elimination import Mixture, memberships, one_cluster
 from bayesdist.kinds.selfcal.infer.gauge import NamedDirection
 from bayesdist.kinds.selfcal.infer.problem import Problem, places_of
-from bayesdist.kinds.selfcal.inputs import Inputs
+from bayesdist.kinds.selfcal.inputs import SelfcalInputs
 from bayesdist.model import DistortionModel
 from bayesdist.utils.arrays import Bool, Float, Int
 
@@ -49,7 +49,7 @@ AMBIGUOUS = 0.05  # fraction of ambiguous groups above which there is a warning
 
 def match_dithers(run: Run) -> Run:
     """Match detections of dithered exposures to stars, with a first solution."""
-    inputs: Inputs = run.inputs
+    inputs: SelfcalInputs = run.inputs
     calibration = calibrated(inputs, lambda text: log.info("match: %s", text))
     table, facts = exposure_table(calibration, inputs), matching_facts(calibration, inputs)
     refuse_unconnected(table)
@@ -77,7 +77,7 @@ def match_dithers(run: Run) -> Run:
     )
 
 
-def calibrated(inputs: Inputs, report: Callable[[str], None]) -> SelfCalibration:
+def calibrated(inputs: SelfcalInputs, report: Callable[[str], None]) -> SelfCalibration:
     """Stars and solution of a self-calibration.
 
     `report` is called with text about the progress.  If the solution does not settle and one
@@ -126,7 +126,7 @@ def rolled_180(rolls: Float) -> list[int]:
     return np.flatnonzero((np.abs(off) < HALF_TURN).all(axis=1)).tolist()
 
 
-def exposure_table(found: SelfCalibration, inputs: Inputs) -> Table:
+def exposure_table(found: SelfCalibration, inputs: SelfcalInputs) -> Table:
     """One row per exposure: its detections, those in common with others, rms in pixels, frame.
 
     'overlapping' counts detections within the field of other exposures.  'common' counts those of
@@ -228,7 +228,7 @@ class MatchingFacts(TypedDict):
     warnings: list[str]
 
 
-def matching_facts(found: SelfCalibration, inputs: Inputs) -> MatchingFacts:
+def matching_facts(found: SelfCalibration, inputs: SelfcalInputs) -> MatchingFacts:
     """Section 'selfcal' of summary.json: numbers of detections and stars."""
     d, friends, p = found.detections, found.friends, found.mode.problem
     raw = inputs.detections  # before they were moved onto a common tangent plane
@@ -273,7 +273,7 @@ def matching_facts(found: SelfCalibration, inputs: Inputs) -> MatchingFacts:
     }
 
 
-def tangent_plane_facts(found: SelfCalibration, inputs: Inputs) -> TangentPlaneFacts | None:
+def tangent_plane_facts(found: SelfCalibration, inputs: SelfcalInputs) -> TangentPlaneFacts | None:
     """Tangent points of exposures and stars, for summary.json; None if the sky is flat."""
     model = found.mode.problem.model
     contact = inputs.contact(model, found.mode.theta)
@@ -315,7 +315,7 @@ def _corners(
     return model.predict(theta, x, y, exposure=np.full(4, exposure), chip=chip, epoch=when)
 
 
-def selfcal_lines(inputs: Inputs) -> Iterator[str]:
+def selfcal_lines(inputs: SelfcalInputs) -> Iterator[str]:
     """Lines of text about stars and free directions of a self-calibration, without sampling."""
     calibration = calibrated(inputs, lambda text: None)
     s, gauge, model = calibration.mode, calibration.gauge, calibration.mode.problem.model
@@ -370,7 +370,7 @@ def matches_of(
     problem: Problem,
     stars: Float,
     detections: Detections,
-    inputs: Inputs,
+    inputs: SelfcalInputs,
     unused: Mapping[str, int],
 ) -> Matches:
     """Detections matched with their stars, in the frame of each exposure's own VAFACTOR.
@@ -382,7 +382,7 @@ def matches_of(
     stars : ndarray, shape (S, q)
         Stars of the solution.
     detections : Detections
-    inputs : Inputs
+    inputs : SelfcalInputs
     unused : mapping of str to int
         Number of detections without a star, by reason.
     """
@@ -480,7 +480,7 @@ def unused_detections(facts: Mapping[str, Any]) -> dict[str, int]:
 
 def load_matched_selfcal(run: Run) -> Run:
     """Run with the detections of an earlier stage, from its folder."""
-    inputs: Inputs = run.inputs
+    inputs: SelfcalInputs = run.inputs
     path, content = run.directory / DETECTIONS, "a file of detections"
     do = "run the stage 'match' again"
     arrays = read_arrays(path, "", content, ARRAYS, do=do)
@@ -524,7 +524,7 @@ def with_detections(
     table : Table, optional
         One row per exposure.
     """
-    inputs: Inputs = run.inputs
+    inputs: SelfcalInputs = run.inputs
     theta, places, mixture = first
     problem = inputs.problem(model, detections, theta, theta)
     return run.having(

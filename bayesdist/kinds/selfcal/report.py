@@ -14,7 +14,7 @@ from matplotlib.collections import LineCollection
 from bayesdist.assess.maps import per_axis
 from bayesdist.files.tables import read_ecsv
 from bayesdist.model.grid import outline_pixels
-from bayesdist.report.contents import REPORT, Plot, Section
+from bayesdist.report.contents import REPORT, PageSection, Plot
 from bayesdist.report.figures.style import CYCLE, INK, PALE, WIDTH, new_figure
 from bayesdist.report.run import ReportedRun, scale_mas
 from bayesdist.report.texttable import MAX_ROWS, TextTable, further, listing, tabulated
@@ -62,7 +62,7 @@ def data_of_selfcal(run: Run) -> SelfcalData:
 
 REPORT.insert(
     "data",
-    Section(
+    PageSection(
         "selfcal",
         "Gauge and stars",
         when=lambda run: isinstance(run.report_data, SelfcalData),

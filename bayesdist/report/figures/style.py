@@ -194,7 +194,7 @@ class _Powers(LogFormatterSciNotation):
         return re.sub(r"\^\{(.*?)\}", lambda m: m[1].translate(_RAISED), _signs(text))
 
 
-class _Plain(ScalarFormatter):
+class _PlainNumbers(ScalarFormatter):
     """Formatter of decimal numbers with a common power of ten in superscript digits."""
 
     def get_offset(self) -> str:
@@ -219,7 +219,7 @@ def plain_ticks(figure: Figure) -> None:
                 (axis.get_minor_formatter(), axis.set_minor_formatter),
             ):
                 if type(now) is ScalarFormatter:
-                    put(_Plain(useOffset=now.get_useOffset(), useMathText=False))
+                    put(_PlainNumbers(useOffset=now.get_useOffset(), useMathText=False))
                 elif type(now) is LogFormatterSciNotation:
                     put(
                         _Powers(

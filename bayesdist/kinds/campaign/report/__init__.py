@@ -4,7 +4,7 @@ from typing import Any
 
 from bayesdist.kinds.campaign.report import linear_terms, lookup, matching, release  # noqa: F401
 from bayesdist.kinds.campaign.report.data import CampaignData
-from bayesdist.report.contents import REPORT, Section
+from bayesdist.report.contents import REPORT, PageSection
 
 __all__: list[str] = []
 
@@ -16,35 +16,35 @@ def _is_campaign(run: Any) -> bool:
 
 REPORT.insert(
     "data",
-    Section(
+    PageSection(
         "campaign",
         "Campaign",
         when=_is_campaign,
         explained=("campaign", ""),
         groups=("Campaign",),
     ),
-    Section(
+    PageSection(
         "campaign-matching",
         "Catalogue and matching",
         parent="campaign",
         when=_is_campaign,
         explained=("campaign", "The catalogue"),
     ),
-    Section(
+    PageSection(
         "campaign-tables",
         "Look-up tables",
         parent="campaign",
         when=_is_campaign,
         explained=("campaign", ""),
     ),
-    Section(
+    PageSection(
         "campaign-time",
         "Linear terms against time",
         parent="campaign",
         when=_is_campaign,
         explained=("campaign", ""),
     ),
-    Section(
+    PageSection(
         "campaign-release",
         "Released files and the alignment of two exposures",
         parent="campaign",

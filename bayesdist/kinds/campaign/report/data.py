@@ -31,7 +31,7 @@ class CatalogStars:
 
 
 @dataclass(frozen=True, eq=False)
-class Detections:
+class DetectionQuality:
     """Quality of the detections, and the selection cuts."""
 
     mag: Float  # (N,), of the detections that are drawn
@@ -55,7 +55,7 @@ class Footprints:
 
 
 @dataclass(frozen=True, eq=False)
-class ChipResiduals:
+class TableResiduals:
     """Residuals on one chip, without look-up tables and, if there are any, with them.
 
     In both cases the polynomial and a linear map of each exposure are fitted. Residuals (N, 2) are
@@ -109,9 +109,9 @@ class CampaignData:
     filter: str
     matching: Table  # content of matching.ecsv
     catalog: CatalogStars | None = None
-    detections: Detections | None = None
+    detections: DetectionQuality | None = None
     footprints: Footprints | None = None
-    residuals: tuple[ChipResiduals, ...] = ()
+    residuals: tuple[TableResiduals, ...] = ()
     series: LinearSeries | None = None
 
 

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import Normalize
 
 from bayesdist.kinds.campaign.report.data import (
-    ChipResiduals,
+    TableResiduals,
     campaign_data,
     chip_name,
     summary_section,
@@ -203,7 +203,7 @@ def residual_map(run: ReportedRun, which: str) -> Plot:
     )
 
 
-def binned_of(chips: Sequence[ChipResiduals], which: str) -> list[BinnedResiduals]:
+def binned_of(chips: Sequence[TableResiduals], which: str) -> list[BinnedResiduals]:
     """Binned residuals of all chips, 'without' or 'with' the tables."""
     all_binned = [c.binned_without if which == "without" else c.binned_with for c in chips]
     return [binned for binned in all_binned if binned is not None]

@@ -14,15 +14,15 @@ from bayesdist.infer import Posterior, fit_linear
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.nodes import corrected_matches, inside_chips, pixel_shifts
 from bayesdist.infer.solution.linear import Rejection
-from bayesdist.kinds.campaign.inputs import Inputs
+from bayesdist.kinds.campaign.inputs import CampaignInputs
 from bayesdist.kinds.campaign.matching import affine_model_of, is_mirrored
 from bayesdist.kinds.campaign.report.data import (
     CampaignData,
     CatalogStars,
-    ChipResiduals,
-    Detections,
+    DetectionQuality,
     Footprints,
     LinearSeries,
+    TableResiduals,
 )
 from bayesdist.model import DistortionModel
 from bayesdist.model.grid import outline_pixels
@@ -35,7 +35,7 @@ WIDEST_CELL = 8  # largest factor on the size of cells
 
 def data_of_campaign(run: Run) -> CampaignData:
     """Data of the figures, prepared once, because star lists and catalogue are large."""
-    inputs: Inputs = run.inputs
+    inputs: CampaignInputs = run.inputs
     matching = read_ecsv(run.directory / "matching.ecsv")
     return CampaignData(
         filter=inputs.filter,
@@ -53,7 +53,7 @@ def _spread_rows(n: int, most: int) -> slice:
     return slice(None, None, max(1, -(-n // most)))
 
 
-def _catalog_stars(inputs: Inputs, matching: Table) -> CatalogStars | None:
+def _catalog_stars(inputs: CampaignInputs, matching: Table) -> CatalogStars | None:
     catalog = inputs.whole_catalog
     if catalog.mag is None or (catalog.sigma_u is None and catalog.sigma_pm_u is None):
         return None
@@ -77,7 +77,7 @@ def _catalog_stars(inputs: Inputs, matching: Table) -> CatalogStars | None:
     )
 
 
-def _detections(inputs: Inputs) -> Detections | None:
+def _detections(inputs: CampaignInputs) -> DetectionQuality | None:
     """Quality and magnitude of an evenly spread subset of the detections."""
     star_lists = inputs.star_lists
     lists, cuts, passed = star_lists.lists, star_lists.cuts, star_lists.passed
@@ -93,7 +93,7 @@ def _detections(inputs: Inputs) -> Detections | None:
         )
     )
     edges = () if cuts.mag is None else cuts.mag
-    return Detections(
+    return DetectionQuality(
         mag=mag,
         q=q,
         kept=passes.astype(bool),
@@ -104,7 +104,7 @@ def _detections(inputs: Inputs) -> Detections | None:
     )
 
 
-def _footprints(posterior: Posterior, inputs: Inputs, mirrored: bool) -> Footprints:
+def _footprints(posterior: Posterior, inputs: CampaignInputs, mirrored: bool) -> Footprints:
     """Outlines of all exposures with the stars of the catalogue.
 
     `mirrored` is True if u has the opposite sign to that of the catalogue.
@@ -124,9 +124,9 @@ def _footprints(posterior: Posterior, inputs: Inputs, mirrored: bool) -> Footpri
 
 
 @one_thread
-def _residuals(run: Run) -> tuple[ChipResiduals, ...]:
+def _residuals(run: Run) -> tuple[TableResiduals, ...]:
     """Residuals of each chip without and with the tables, along the detector axes."""
-    inputs: Inputs = run.inputs
+    inputs: CampaignInputs = run.inputs
     pairs, moved, tables = run.stars, run.matches, run.tables.tables
     model = affine_model_of(inputs.config, pairs)
     errors, farthest = run.errors.by_magnitude, inputs.config.fit.clip_abs
@@ -161,7 +161,7 @@ def _residuals(run: Run) -> tuple[ChipResiduals, ...]:
         rows = _spread_rows(int(on_chip.sum()), MAX_MARKERS // (2 * len(model.chips)))
         points = [r[on_chip][rows] for r in shifts]
         with_tables = (points[-1], binned[-1]) if tables else (None, None)
-        out.append(ChipResiduals(chip, points[0], with_tables[0], binned[0], with_tables[1]))
+        out.append(TableResiduals(chip, points[0], with_tables[0], binned[0], with_tables[1]))
     return tuple(out)
 
 

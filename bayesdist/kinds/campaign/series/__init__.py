@@ -1,9 +1,9 @@
 """Trends of coefficients of many exposures with time: lines, breaks, scatter, predictions."""
 
 from bayesdist.kinds.campaign.series.compare import (
-    Comparison,
     FilterDependence,
-    Verdict,
+    TrendComparison,
+    TrendVerdict,
     compare,
     default_candidates,
     describe,
@@ -11,10 +11,10 @@ from bayesdist.kinds.campaign.series.compare import (
     serial_correlation,
 )
 from bayesdist.kinds.campaign.series.posterior import (
-    Change,
+    ChangeAtBreak,
     HeldOut,
-    Prediction,
     SeriesPosterior,
+    SeriesPrediction,
     block_folds,
     exposure_folds,
     fit_series,
@@ -24,16 +24,16 @@ from bayesdist.kinds.campaign.series.series import KINDS, Design, Series, TrendM
 
 __all__ = [
     "KINDS",
-    "Change",
-    "Comparison",
+    "ChangeAtBreak",
     "Design",
     "FilterDependence",
     "HeldOut",
-    "Prediction",
     "Series",
     "SeriesPosterior",
+    "SeriesPrediction",
+    "TrendComparison",
     "TrendModel",
-    "Verdict",
+    "TrendVerdict",
     "block_folds",
     "compare",
     "default_candidates",

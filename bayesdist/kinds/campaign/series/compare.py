@@ -22,7 +22,7 @@ from astropy.table import Table
 from bayesdist.errors import InputError
 from bayesdist.infer.kernel import precisions
 from bayesdist.kinds.campaign.series.posterior import (
-    Change,
+    ChangeAtBreak,
     HeldOut,
     SeriesPosterior,
     block_folds,
@@ -61,7 +61,7 @@ CLAIMS = {
 
 
 @dataclass(frozen=True, eq=False)
-class Comparison:
+class TrendComparison:
     """Trends fitted to a series, with their predictions of held-out exposures.
 
     Parameters
@@ -163,7 +163,7 @@ class Comparison:
         return out
 
 
-def compare(series: Series, candidates: Sequence[TrendModel], *, seed: int = 1) -> Comparison:
+def compare(series: Series, candidates: Sequence[TrendModel], *, seed: int = 1) -> TrendComparison:
     """Compare trends by the predictive density of held-out exposures.
 
     The exposures are held out in 30 groups, with neighbours in different groups.  If the residuals
@@ -181,7 +181,7 @@ def compare(series: Series, candidates: Sequence[TrendModel], *, seed: int = 1) 
 
     Returns
     -------
-    Comparison
+    TrendComparison
         Trends with one unknown break are omitted if the break cannot be significant: at the best
         date, the gain in likelihood is smaller than a significant difference.
     """
@@ -194,7 +194,7 @@ def compare(series: Series, candidates: Sequence[TrendModel], *, seed: int = 1) 
     else:
         scheme, fold = "exposures", exposure_folds(series.epoch)
     scores = tuple(held_out(p, fold, seed=seed) for p in posteriors)
-    return Comparison(trends, posteriors, scores, scheme, correlation)
+    return TrendComparison(trends, posteriors, scores, scheme, correlation)
 
 
 def _fitted(
@@ -311,19 +311,19 @@ class FilterDependence:
     ----------
     names : tuple of str
         Filters. The first one has most exposures; the others are compared with it.
-    all_slopes : Change
+    all_slopes : ChangeAtBreak
         Differences of the slopes per year from those of the first filter, concatenated.
     common, separate : SeriesPosterior
         Posteriors with common slopes, and with a slope per filter.
-    comparison : Comparison
+    comparison : TrendComparison
         Comparison of these two, and of the trends added by `compare`.
     """
 
     names: tuple[str, ...]
-    all_slopes: Change
+    all_slopes: ChangeAtBreak
     common: SeriesPosterior
     separate: SeriesPosterior
-    comparison: Comparison
+    comparison: TrendComparison
 
     @property
     def depends(self) -> bool:
@@ -373,7 +373,7 @@ def filter_dependence(series: Series, trend: TrendModel, *, seed: int = 1) -> Fi
     slopes = separate.group_slope
     return FilterDependence(
         names=names,
-        all_slopes=Change.of(np.ascontiguousarray(slopes.reshape(len(slopes), -1))),
+        all_slopes=ChangeAtBreak.of(np.ascontiguousarray(slopes.reshape(len(slopes), -1))),
         common=common,
         separate=separate,
         comparison=comparison,
@@ -384,7 +384,7 @@ def filter_dependence(series: Series, trend: TrendModel, *, seed: int = 1) -> Fi
 
 
 @dataclass(frozen=True, eq=False)
-class Verdict:
+class TrendVerdict:
     """Description of the trend of a series.
 
     Parameters
@@ -393,7 +393,7 @@ class Verdict:
         Short description: 'no line', 'line', or 'break at 2009.41' with the form of the segments.
     text : str
         The claim in full sentences, with its evidence.
-    comparison : Comparison
+    comparison : TrendComparison
         Comparison of all candidates.
     posterior : SeriesPosterior
         Posterior of the selected trend.
@@ -406,7 +406,7 @@ class Verdict:
 
     claim: str
     text: str
-    comparison: Comparison
+    comparison: TrendComparison
     posterior: SeriesPosterior
     breaks: Float
     rivals: tuple[str, ...]
@@ -442,7 +442,7 @@ def describe(
     *,
     breaks: tuple[float, ...] = (),
     seed: int = 1,
-) -> Verdict:
+) -> TrendVerdict:
     """Describe the trend of a series in words.
 
     Parameters
@@ -457,7 +457,7 @@ def describe(
 
     Returns
     -------
-    Verdict
+    TrendVerdict
 
     Raises
     ------
@@ -471,10 +471,10 @@ def describe(
     claim = _claim(posterior.trend, dates)
     rivals = _rivals(comparison)
     text = _text(claim, comparison, posterior, dates, rivals)
-    return Verdict(claim, text, comparison, posterior, dates, rivals)
+    return TrendVerdict(claim, text, comparison, posterior, dates, rivals)
 
 
-def _rivals(comparison: Comparison) -> tuple[str, ...]:
+def _rivals(comparison: TrendComparison) -> tuple[str, ...]:
     selected = comparison.selected
     return tuple(
         c.name
@@ -499,7 +499,7 @@ def _claim(trend: TrendModel, dates: Float) -> str:
 
 def _text(
     claim: str,
-    comparison: Comparison,
+    comparison: TrendComparison,
     posterior: SeriesPosterior,
     dates: Float,
     rivals: tuple[str, ...],

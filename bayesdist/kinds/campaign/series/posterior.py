@@ -34,7 +34,7 @@ N_FOLDS = 30  # default number of folds
 
 
 @dataclass(frozen=True, eq=False)
-class Change:
+class ChangeAtBreak:
     """Change of k coefficients, with its covariance.
 
     Parameters
@@ -49,7 +49,7 @@ class Change:
     cov: Float
 
     @classmethod
-    def of(cls, draws: Float) -> Change:
+    def of(cls, draws: Float) -> ChangeAtBreak:
         """Compute mean and covariance from draws.
 
         Parameters
@@ -59,7 +59,7 @@ class Change:
 
         Returns
         -------
-        Change
+        ChangeAtBreak
         """
         return cls(draws.mean(axis=0), np.atleast_2d(np.cov(draws, rowvar=False)))
 
@@ -86,7 +86,7 @@ class Change:
 
 
 @dataclass(frozen=True, eq=False)
-class Prediction:
+class SeriesPrediction:
     """Predicted coefficients at M epochs.
 
     Parameters
@@ -227,7 +227,7 @@ class SeriesPosterior:
         columns = slice(first, first + self.design.n_groups - 1)
         return np.swapaxes(self._parameters[..., columns], 1, 2)
 
-    def change(self, number: int = 0) -> tuple[Change, Change]:
+    def change(self, number: int = 0) -> tuple[ChangeAtBreak, ChangeAtBreak]:
         """Changes of the coefficients and of their slopes at a break.
 
         Parameters
@@ -237,7 +237,7 @@ class SeriesPosterior:
 
         Returns
         -------
-        level, slope : Change
+        level, slope : ChangeAtBreak
             Values after the break minus those before it, at the date of the break. If the trend
             does not allow the slopes to change, their change is zero with zero error.
 
@@ -254,11 +254,11 @@ class SeriesPosterior:
         at = self.alpha + self.beta * (date - self.reference[:, None])
         level = at[:, number + 1] - at[:, number]
         slope = self.beta[:, number + 1] - self.beta[:, number]
-        return Change.of(level), Change.of(slope)
+        return ChangeAtBreak.of(level), ChangeAtBreak.of(slope)
 
     # -- prediction -------------------------------------------------------------------------------
 
-    def predict(self, epoch: ArrayLike, *, group: str | None = None) -> Prediction:
+    def predict(self, epoch: ArrayLike, *, group: str | None = None) -> SeriesPrediction:
         """Predict the coefficients at epochs between the first and the last exposure.
 
         Parameters
@@ -270,7 +270,7 @@ class SeriesPosterior:
 
         Returns
         -------
-        Prediction
+        SeriesPrediction
 
         Raises
         ------
@@ -282,7 +282,7 @@ class SeriesPosterior:
         mean = trend.mean(axis=0)
         off = trend - mean
         cov = np.einsum("nmi,nmj->mij", off, off) / (len(off) - 1)
-        return Prediction(t, mean, cov, cov + self.scatter.mean(axis=0))
+        return SeriesPrediction(t, mean, cov, cov + self.scatter.mean(axis=0))
 
     def _trend_draws(self, t: Float, group: str | None) -> Float:
         """Draws (n, M, k) of the trend at epochs t (M,)."""

@@ -175,7 +175,7 @@ class EvenStars:
 
 
 @dataclass(frozen=True, eq=False)
-class StarPiece:
+class EliminatedPiece:
     """A chunk of stars with their n detections, displaced along the axes of the polynomials."""
 
     stars: slice  # range of stars in the problem
@@ -206,7 +206,7 @@ class StarPiece:
         return csr_array((values.ravel(), (row, column.ravel())), shape=shape)
 
 
-def pieces(columns: AddedColumns) -> Iterator[StarPiece]:
+def pieces(columns: AddedColumns) -> Iterator[EliminatedPiece]:
     """Iterate over the detections in chunks of stars."""
     p, structure = columns.problem, columns.structure
     n_sparse_params = columns.n_params - p.model.n_polynomial
@@ -247,7 +247,7 @@ def pieces(columns: AddedColumns) -> Iterator[StarPiece]:
         sparse = csr_array((data, (row, at)), shape=(2 * n, columns.n_sparse))
         star, by_star = p.star[rows] - first, back[group] @ places_by_star(p, rows)
         frame = structure.linear[group]
-        yield StarPiece(slice(first, last), rows, star, by_star, frame, tuple(dense), sparse)
+        yield EliminatedPiece(slice(first, last), rows, star, by_star, frame, tuple(dense), sparse)
         first = last
 
 
@@ -274,7 +274,7 @@ def without_parameters(solution: SelfCalibrationMode, N: Float, score: Float) ->
 
 
 def absorbed_by_stars(
-    columns: AddedColumns, piece: StarPiece, scores: SelfcalScores, stars: Float
+    columns: AddedColumns, piece: EliminatedPiece, scores: SelfcalScores, stars: Float
 ) -> Absorbed:
     """Sums over the detections of each star of a chunk.
 
@@ -343,7 +343,7 @@ def eliminated(
 
 
 def add_products(
-    N: Float, left: AddedColumns, right: AddedColumns, piece: StarPiece, H: Float
+    N: Float, left: AddedColumns, right: AddedColumns, piece: EliminatedPiece, H: Float
 ) -> None:
     """Add Z^T H Z of a chunk to N, with internal columns; `left` may lack the dense functions."""
     n, n_left_sparse = len(piece), left.n_sparse
@@ -378,7 +378,7 @@ def add_products(
     ]
 
 
-def _pulled(columns: AddedColumns, piece: StarPiece, gradient: Float) -> Float:
+def _pulled(columns: AddedColumns, piece: EliminatedPiece, gradient: Float) -> Float:
     """Sums (n,) of Z^T g over a chunk, with internal columns."""
     out = np.zeros(columns.sparse.stop)
     for code, (members, values) in enumerate(piece.dense):
@@ -581,7 +581,7 @@ def squared_scores(solution: SelfCalibrationMode, scores: SelfcalScores) -> Squa
     )
 
 
-def star_scores(columns: AddedColumns, piece: StarPiece, gradient: Float) -> Float:
+def star_scores(columns: AddedColumns, piece: EliminatedPiece, gradient: Float) -> Float:
     """Scores (S, n) of each star of a chunk with respect to all columns.
 
     Stars are at their modes: the gradient with respect to their parameters is zero, so that nothing
@@ -598,7 +598,7 @@ def star_scores(columns: AddedColumns, piece: StarPiece, gradient: Float) -> Flo
     return out[:, columns.order]
 
 
-def _displacements(columns: AddedColumns, piece: StarPiece, root: Float) -> Float:
+def _displacements(columns: AddedColumns, piece: EliminatedPiece, root: Float) -> Float:
     """Displacements (n, 2, f) of detections due to changes `root` (internal columns, f)."""
     out = np.zeros((len(piece), 2, root.shape[1]))
     for code, (members, values) in enumerate(piece.dense):

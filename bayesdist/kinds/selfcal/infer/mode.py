@@ -250,7 +250,7 @@ class _Begun:
 
 
 @dataclass(frozen=True, eq=False)
-class _Found:
+class _FoundMode:
     """Result of a search."""
 
     pieces: MappedPieces[of.StarPiece]
@@ -291,7 +291,7 @@ def _loaded(
 
 def _solved(
     problem: Problem, begin: _Begun, free: Int, prior: Prior, jitter: float | None
-) -> _Found:
+) -> _FoundMode:
     theta, near = begin.theta, False
     pieces = begin.pieces.map(of.at_medians if begin.medians else of.at_stars, theta)
     mixture = begin.mixture or wide_mixture(pieces, theta)
@@ -322,7 +322,7 @@ def _solved(
                 settled.sum(of.expansion_of),
                 curvatures(problem, settled, theta, mixture),
             )
-            return _Found(settled, theta, mixture, free, expansion, at_solution, prior)
+            return _FoundMode(settled, theta, mixture, free, expansion, at_solution, prior)
         near = decrement < NEAR and change < 0.1
         mixture = after
     raise NotSettledError(
@@ -401,11 +401,11 @@ def solve_in_gauge(
     """
     prior = prior_at(theta)
 
-    def solved(decision: Decision, begin: _Begun) -> _Found:
+    def solved(decision: Decision, begin: _Begun) -> _FoundMode:
         free = np.setdiff1d(np.arange(problem.model.n_params), decision.held)
         return replace(_solved(problem, begin, free, prior, jitter), decision=decision)
 
-    def asked_at(found: _Found) -> Decision:
+    def asked_at(found: _FoundMode) -> Decision:
         alone, informed = found.curvatures
         prior_there = prior_at(found.theta)
         return find_gauge(problem, found.theta, alone, prior_there, known=informed).decision
@@ -458,9 +458,9 @@ def mode_at(
             pieces.sum(of.expansion_of),
             curvatures(problem, pieces, theta, mixture),
         )
-        return _Found(pieces, theta, mixture, free, expansion, at_solution, prior, decision).mode(
-            problem
-        )
+        return _FoundMode(
+            pieces, theta, mixture, free, expansion, at_solution, prior, decision
+        ).mode(problem)
 
 
 def gauge_of(

@@ -17,7 +17,7 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from pydantic import Field, PositiveFloat
 
-from bayesdist.app.config.fit import Polynomials
+from bayesdist.app.config.fit import PolynomialBlock
 from bayesdist.app.config.reading import load_text, validated
 from bayesdist.app.config.section import (
     ChipBlock,
@@ -298,7 +298,7 @@ class PlanConfig(Section):
 
     detector: Detector = Detector()
     chip: list[PlannedChip] = Field(default_factory=list)
-    model: Polynomials
+    model: PolynomialBlock
     selfcal: PlannedSelfcal = PlannedSelfcal()
     gauge: PlannedGauge = PlannedGauge()
     stars: StarsBlock

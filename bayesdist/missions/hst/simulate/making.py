@@ -158,7 +158,7 @@ def simulate_acs(
         detections=(),
         settings=settings,
     )
-    detector = Detector(centroid, false, blended, cte)
+    detector = DetectionErrors(centroid, false, blended, cte)
     measured = []
     for k, exposure in enumerate(log):
         measured.append(star_list(truth, exposure.name, detector, rng(6, *keys[exposure])))
@@ -202,7 +202,7 @@ REACH = 2.0  # pixels: closer neighbours are blended
 
 
 @dataclass(frozen=True)
-class Detector:
+class DetectionErrors:
     """Errors of the detections of an exposure."""
 
     centroid: float = 1.0  # factor on the centroid errors; 0 gives exact positions
@@ -224,7 +224,7 @@ def cte_shift(chip: int, y: Float, mag: Float, epoch: float) -> Float:
 
 
 def star_list(
-    truth: AcsTruth, exposure: str, detector: Detector, rng: np.random.Generator
+    truth: AcsTruth, exposure: str, detector: DetectionErrors, rng: np.random.Generator
 ) -> tuple[Detections, DetectionTruth]:
     """Simulated detections of an exposure in random order, and their truth."""
     e = truth.frames.names.index(exposure)
@@ -262,7 +262,7 @@ def _measured(
     y: Float,
     mag: Float,
     epoch: float,
-    detector: Detector,
+    detector: DetectionErrors,
     rng: np.random.Generator,
 ) -> dict[str, NDArray[Any]]:
     """Columns of the measured stars of a chip, from their true pixels and magnitudes."""

@@ -298,7 +298,7 @@ def residual_correlation(
         See `bayesdist.missions.wise.assess.residual_field.residual_field`.
     """
     field = residual_field(bins, order=order)
-    rings = _Rings.of(field)
+    rings = _SeparationRings.of(field)
     products = rings.products(field.image(field.sem * field.white)[None])[0]
     by_chance = np.concatenate(
         [
@@ -328,7 +328,7 @@ def residual_correlation(
 
 
 @dataclass(frozen=True, eq=False)
-class _Rings:
+class _SeparationRings:
     """Lags between bins, grouped into rings of separation."""
 
     shape: tuple[int, int]
@@ -342,7 +342,7 @@ class _Rings:
         return np.rint(self.counts / 2).astype(np.int64)
 
     @classmethod
-    def of(cls, field: ResidualField) -> _Rings:
+    def of(cls, field: ResidualField) -> _SeparationRings:
         ny, nx = field.used.shape
         shape = (fft.next_fast_len(2 * ny), fft.next_fast_len(2 * nx))
         dx = fft.fftfreq(shape[1], 1 / shape[1]) * field.pitch[0]

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from bayesdist.report.contents import Registry, Section
+from bayesdist.report.contents import PageSection, Registry
 
 if TYPE_CHECKING:
     from bayesdist.assess import UncertaintyMap, VectorMap
@@ -18,14 +18,14 @@ if TYPE_CHECKING:
 BANDS = Registry(
     "bands",
     (
-        Section("overview", "Overview"),
-        Section("vectors", "Distortion"),
-        Section("histograms", "Residuals with and without calibration"),
-        Section("tables", "Residuals in bins"),
-        Section("structure", "Structure left in the residuals"),
-        Section("formal", "Uncertainties"),
-        Section("coverage", "Coverage"),
-        Section("provenance", "Provenance"),
+        PageSection("overview", "Overview"),
+        PageSection("vectors", "Distortion"),
+        PageSection("histograms", "Residuals with and without calibration"),
+        PageSection("tables", "Residuals in bins"),
+        PageSection("structure", "Structure left in the residuals"),
+        PageSection("formal", "Uncertainties"),
+        PageSection("coverage", "Coverage"),
+        PageSection("provenance", "Provenance"),
     ),
 )
 

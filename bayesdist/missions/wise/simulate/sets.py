@@ -94,7 +94,7 @@ class WiseSet:
     model : DistortionModel
     theta : ndarray, shape (30,)
         True parameters: the published distortion.
-    survey : Survey
+    survey : FrameSurvey
         Frames of the pairs.
     false_matches : FalseMatches
         Distribution of false matches.
@@ -110,7 +110,7 @@ class WiseSet:
     false_fraction: float
     model: DistortionModel
     theta: Float
-    survey: Survey
+    survey: FrameSurvey
     false_matches: FalseMatches
     pattern: PartitionPattern | None
     chunk_pairs: int = CHUNK
@@ -283,7 +283,7 @@ NODES = 16  # quadrature nodes per half axis, for means over the array
 
 
 @dataclass(frozen=True, eq=False)
-class Survey:
+class FrameSurvey:
     """Names, epochs and star densities of F frames."""
 
     names: tuple[str, ...]  # scan and frame, such as '00350a001'
@@ -295,7 +295,7 @@ class Survey:
         return self.density / self.density.sum()
 
 
-def survey(n_frames: int = FRAMES) -> Survey:
+def survey(n_frames: int = FRAMES) -> FrameSurvey:
     """Consecutive frames along a polar orbit.
 
     The stars are in a plane-parallel layer, so that their density is proportional to the cosecant
@@ -311,7 +311,7 @@ def survey(n_frames: int = FRAMES) -> Survey:
         for s, f in zip(scan.tolist(), frame.tolist(), strict=True)
     )
     epoch = np.asarray(START + number * CADENCE_S / YEAR_S, np.float64)
-    return Survey(names, epoch, POLE / sine / ARCSEC2)
+    return FrameSurvey(names, epoch, POLE / sine / ARCSEC2)
 
 
 def match_radius(r2: Float) -> Float:
@@ -345,7 +345,7 @@ class FalseMatches:
         return np.column_stack([radius * np.cos(angle), radius * np.sin(angle)])
 
 
-def false_matches(survey: Survey, scale: float, share: float) -> FalseMatches:
+def false_matches(survey: FrameSurvey, scale: float, share: float) -> FalseMatches:
     """Distribution of false matches with an expected fraction `share` of all pairs.
 
     `scale` is in arcsec per pixel.  Raises InputError if the fraction is outside of [0, 1).

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesdist.kinds.campaign.series import Series, TrendModel, Verdict
+from bayesdist.kinds.campaign.series import Series, TrendModel, TrendVerdict
 
 COEFFICIENTS = ("A_2", "B_2", "B_3")
 REFERENCE = (2004.5, 2012.5)
@@ -86,7 +86,7 @@ def drifting(seed: int, n: int = 80, memory: float = 0.7, k: int = 2) -> Series:
     return Series.of(epoch, values, 0.03, coefficients=tuple("abcdef"[:k]))
 
 
-def is_line(verdict: Verdict) -> bool:
+def is_line(verdict: TrendVerdict) -> bool:
     """True if a drift is claimed that goes on."""
     trend = verdict.posterior.trend
     return trend.has_slope and trend.kind != "spline"

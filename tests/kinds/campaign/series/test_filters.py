@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bayesdist.errors import DegenerateError, InputError
-from bayesdist.kinds.campaign.series import Change, TrendModel, filter_dependence, fit_series
+from bayesdist.kinds.campaign.series import ChangeAtBreak, TrendModel, filter_dependence, fit_series
 from tests.reduced import only_in_full
 
 from .campaign import LINES, campaign
@@ -14,9 +14,9 @@ from .campaign import LINES, campaign
 FILTERS = {"F606W": 70, "F814W": 25, "F435W": 20}
 
 
-def by_filter(answer, draws) -> dict[str, Change]:
+def by_filter(answer, draws) -> dict[str, ChangeAtBreak]:
     """Changes (n, filters, k) of all filters but the first, by name."""
-    return {name: Change.of(draws[:, k]) for k, name in enumerate(answer.names[1:])}
+    return {name: ChangeAtBreak.of(draws[:, k]) for k, name in enumerate(answer.names[1:])}
 
 
 @pytest.mark.slow

@@ -13,11 +13,10 @@ from astropy.table import QTable
 from astropy.time import Time
 
 import bayesdist as bd
+from tests.app.conftest import BUDGET, REQUIREMENTS
+from tests.app.support import CENTRE, SIZE, as_table, good, simulated, summary_of, write_job
 from tests.calibration.cameras import PIXEL, camera
 from tests.reduced import only_in_full
-
-from .conftest import BUDGET, REQUIREMENTS
-from .support import CENTRE, SIZE, as_table, good, simulated, summary_of, write_job
 
 SETTINGS = {
     "sampler": {"target_ess": 100, "target_rhat": 1.05},
@@ -158,7 +157,7 @@ def test_an_earlier_calibration_may_be_named_relatively(finished, tmp_path, monk
 
 
 @pytest.mark.slow
-@only_in_full("tests/app/test_kinds_of_data has errors by magnitude")
+@only_in_full("tests/kinds/matches/test_kinds_of_data has errors by magnitude")
 def test_stars_by_magnitude_are_found_without_being_asked():
     stars, _ = simulated(800, mag=np.linspace(12.0, 18.0, 800))
     bare = stars.with_columns(sigma_u=None, sigma_v=None)

@@ -116,7 +116,7 @@ def test_no_stage_takes_all_rows_into_memory(job, tmp_path, on_disk, monkeypatch
     monkeypatch.setattr(
         Matches, "_complete", lambda self: (sizes.append(np.size(self.x)), complete(self))[1]
     )
-    for name in ("app.artefacts.stars", "kinds.matches.stars", "kinds.matches.init"):
+    for name in ("app.stars", "kinds.matches.kind", "kinds.matches.init"):
         monkeypatch.setattr(f"bayesdist.{name}.SAMPLE", 900)
     monkeypatch.setattr("bayesdist.infer.solution.linear.MEDIAN_STARS", 900)
     good("init", tmp_path / "c.toml", "--matches", job.parent / "stars")

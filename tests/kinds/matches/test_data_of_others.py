@@ -10,8 +10,8 @@ import pytest
 from astropy.table import MaskedColumn, Table
 
 from bayesdist.infer import load_posterior
-from tests.app.layouts import field_of, plane_of
 from tests.app.support import good
+from tests.kinds.matches.layouts import field_of, plane_of
 from tests.reduced import case_in_full, only_in_full
 
 N = 300
@@ -108,7 +108,7 @@ def test_from_init_to_check(tmp_path, name):
     assert any(line.startswith("rank") for line in out.splitlines())
 
 
-@only_in_full("tests/app/test_layouts runs a layout")
+@only_in_full("tests/kinds/matches/test_layouts runs a layout")
 @pytest.mark.slow
 @pytest.mark.usefixtures("no_report")
 @pytest.mark.parametrize("name", RUN)

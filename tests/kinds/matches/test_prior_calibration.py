@@ -19,9 +19,8 @@ from bayesdist.errors import InputError
 from bayesdist.infer import save_fit
 from bayesdist.infer.solution.linear import NO_REJECTION
 from bayesdist.kinds.matches.kind import earlier_calibration
+from tests.app.support import as_table, good, refused
 from tests.reduced import case_in_full, only_in_full
-
-from .support import as_table, good, refused
 
 SIZE = (1000.0, 800.0)
 CHIP = bd.Chip(1, "chip 1", SIZE, (500.5, 400.5))

@@ -13,8 +13,17 @@ from astropy.table import Table
 from bayesdist.data import read_matches, tangent_plane
 from bayesdist.infer import load_posterior
 from bayesdist.kinds.campaign.config import CampaignBlock
-from tests.app.layouts import LAYOUTS, POINT, SCALE, SIGMA, field_of, gaia_table, plane_of, sky_of
 from tests.app.support import good, refused
+from tests.kinds.matches.layouts import (
+    LAYOUTS,
+    POINT,
+    SCALE,
+    SIGMA,
+    field_of,
+    gaia_table,
+    plane_of,
+    sky_of,
+)
 from tests.reduced import case_in_full
 
 BY_NAME = {layout.name: layout for layout in LAYOUTS}

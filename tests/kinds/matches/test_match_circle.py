@@ -133,7 +133,7 @@ SHORT = {
     "sampler": {"target_ess": 100, "target_rhat": 1.05},
     "assess": {"grid": (5, 5), "draws": 100},
 }
-# a jitter would be sampled alike, and takes most of the time (tests/app/test_calibrate.py)
+# a jitter would be sampled alike, and takes most of the time (`test_calibrate.py`)
 NO_JITTER = {"outliers": {"jitter": 0.0}}
 FILES = ("stars.ecsv", "stars.parquet", "matches.h5")
 
