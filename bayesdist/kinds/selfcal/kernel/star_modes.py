@@ -263,11 +263,12 @@ def _to_mode_at_rest(own, n, j2, odds, log_core, c0, c1, p00, p10, p11, pu, pv, 
         value, b0, b1, l00, l10, l11 = _expanded_at_rest(
             own, j2, odds, c0, c1, p00, p10, p11, pu, pv, observed
         )
-        if not l00 > 0.0:
-            if not observed:
-                break  # nothing known: a star without members
+        if observed and min(l00, l11) < least:
+            # hardly curved, or not at all: eliminating the star would divide by almost nothing
             observed, failed = False, True
             continue
+        if not l00 > 0.0:
+            break  # nothing known: a star without members
         z0 = b0 / l00
         z1 = (b1 - l10 * z0) / l11
         decrement = z0 * z0 + z1 * z1
@@ -291,7 +292,7 @@ def _to_mode_at_rest(own, n, j2, odds, log_core, c0, c1, p00, p10, p11, pu, pv, 
     value, b0, b1, l00, l10, l11 = _expanded_at_rest(
         own, j2, odds, c0, c1, p00, p10, p11, pu, pv, observed
     )
-    if observed and not l00 > 0.0:
+    if observed and min(l00, l11) < least:
         observed = False
         value, b0, b1, l00, l10, l11 = _expanded_at_rest(
             own, j2, odds, c0, c1, p00, p10, p11, pu, pv, observed
@@ -310,7 +311,7 @@ def to_mode(
     `seen` is True to request the curvature of the mixture, False for EM weights.
 
     Returns the log density, and True if the curvature is that of the mixture.  EM weights are also
-    used if the curvature of the mixture is not positive.
+    used if the curvature of the mixture in position is below the square of `least`.
     """
     whole_vectors()
     q, observed, failed, value, decrement = len(p), True, False, 0.0, 1.0
@@ -323,11 +324,13 @@ def to_mode(
         return value, observed
     for _ in range(MOST_STEPS):
         value = _expanded(own, n, j2, odds, time, factor, centre, precision, p, S, A, b, observed)
-        if not cholesky(A, q):
-            if not observed:
-                break  # nothing known: a star without members
+        positive = cholesky(A, q)
+        if observed and not (positive and min(A[0, 0], A[1, 1]) >= least):
+            # hardly curved, or not at all: eliminating the star would divide by almost nothing
             observed, failed = False, True
             continue
+        if not positive:
+            break  # nothing known: a star without members
         decrement = _solve(A, b, q)
         if observed and decrement > NEAR:
             observed = False
@@ -346,7 +349,7 @@ def to_mode(
     for attempt in range(2):
         observed = seen and attempt == 0
         value = _expanded(own, n, j2, odds, time, factor, centre, precision, p, S, A, b, observed)
-        if cholesky(A, q):
+        if cholesky(A, q) and (not observed or min(A[0, 0], A[1, 1]) >= least):
             break
     return value + _log_density(own, n, j2, log_core), observed
 

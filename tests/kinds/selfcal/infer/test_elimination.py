@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.linalg import block_diag
+from scipy.optimize import brentq
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
@@ -349,5 +350,37 @@ def test_information_is_never_negative(distance):
     far = stars + distance * np.column_stack([np.cos(angle), np.sin(angle)])
     H = expand(problem, simulated.theta, mixture, far, observed=False)[0].curvature
     best = expand(problem, simulated.theta, mixture, stars, observed=False)[0].curvature
+    scale = np.sqrt(np.diag(best))
+    assert np.linalg.eigvalsh(H / np.outer(scale, scale))[0] > -1e-9
+
+
+def test_information_is_not_negative_where_a_star_is_hardly_curved():
+    """Three detections in a row, whose curvatures along it almost cancel at the middle one.
+
+    With w the probability that a detection at a distance r is a true one, and s its error, its
+    curvature is w (1 - (1 - w) r^2 / s^2) / s^2; the outer two are negative.
+    """
+    simulated = field(6, 8, 150)
+    problem, stars = problem_of(simulated)
+    mixture, theta = Mixture(0.1, 0.01), simulated.theta
+    star = int(np.flatnonzero(problem.counts == 3)[0])
+    rows = problem.starts[star] + np.arange(3)
+    var, W = problem.var.copy(), problem.W.copy()
+    var[rows], W[rows] = var[rows[0]], W[rows[0]]
+    s2, uu = var[rows[0]] + mixture.jitter**2, W[rows[0], 0]
+    odds = 2 * np.pi * s2 * np.exp(problem.log_outlier) * mixture.fraction / (1 - mixture.fraction)
+
+    def curvature(r: float) -> float:
+        w = 1 / (1 + odds * np.exp([0.0, uu * r * r / (2 * s2)]))
+        outer = uu - (1 - w[1]) * (uu * r) ** 2 / s2
+        return (w[0] * uu + 2 * w[1] * outer) / s2 - 0.1 * problem.least_root**2
+
+    apart = brentq(curvature, 0.2, 0.4)
+    places, middle = problem.places(theta)[rows], stars[star]
+    offset = problem.offset.copy()
+    offset[rows] += middle + np.array([[0.0, 0.0], [apart, 0.0], [-apart, 0.0]]) - places
+    row = replace(problem, var=var, W=W, offset=offset)
+    H = expand(row, theta, mixture, stars, observed=False)[0].curvature
+    best = expand(problem, theta, mixture, stars, observed=False)[0].curvature
     scale = np.sqrt(np.diag(best))
     assert np.linalg.eigvalsh(H / np.outer(scale, scale))[0] > -1e-9
