@@ -59,6 +59,7 @@ RADIAL_BINS = 14
 STARS_PER_BIN = 40
 RADIAL_PASSES = 6
 UNEQUAL = 1.3  # ratio of the errors of single stars beyond which other errors are tried as well
+JITTERS = (0.1, 0.3, 1.0, 3.0, 10.0)  # squared, in typical variances; see `_with_jitter`
 COMMON = 0.8  # fraction of the smallest variance that may be caused by the displacement itself
 AXES = ((0, 0), (0, 1), (1, 1))
 TINY = 1e-300
@@ -120,13 +121,13 @@ def displaced_group(
     if n < MIN_STARS or not np.median((residual**2).sum(axis=0)) > TINY:
         return None
     order = np.random.default_rng(1).permutation(n)[:MAX_STARS]
-    possible = [
-        _Stars.of(residual[:, order], errors) for errors in _possible_errors(covariance[:, order])
-    ]
+    residual, covariance = residual[:, order], covariance[:, order]
+    possible = [_Stars.of(residual, errors) for errors in _possible_errors(covariance)]
     mixtures, largest, noise = zip(*(_searched(stars) for stars in possible), strict=True)
     if not max(largest) >= max(noise) + LEAST_GAIN:
         return None
-    return _tested(list(zip(possible, mixtures, strict=True)))
+    further = [] if len(possible) == 1 else _with_jitter(residual, covariance)
+    return _tested(list(zip(possible, mixtures, strict=True)), further)
 
 
 def _by_star(
@@ -286,15 +287,35 @@ def _searched(stars: _Stars) -> tuple[_Mixture, float, float]:
     return fit, likelihood, _elliptical(every, single, one)
 
 
-def _tested(found: list[tuple[_Stars, _Mixture]]) -> DisplacedGroup:
-    """Test of the mixtures, each for other errors of the same stars, and estimate of the group."""
+def _with_jitter(residual: Float, covariance: Float) -> list[_Stars]:
+    """Stars with an error that is common to all in addition to the stated ones, of several sizes.
+
+    Two groups add to errors in the same way: more, in units of the stated ones, where these are
+    small.
+    """
+    typical = float(np.median(covariance[0] + covariance[2])) / 2
+    round_error = np.array([1.0, 0.0, 1.0])[:, None] * typical
+    return [_Stars.of(residual, covariance + factor * round_error) for factor in JITTERS]
+
+
+def _tested(found: list[tuple[_Stars, _Mixture]], further: list[_Stars]) -> DisplacedGroup:
+    """Test of the mixtures, each for other errors of the same stars, and estimate of the group.
+
+    The noise may have `further` errors as well.
+    """
     n_scales = len(SCALES)
     weights = np.full((1, n_scales), 0.1 / (n_scales - 1))
     weights[0, int(np.argmin(np.abs(SCALES - 1.0)))] = 0.9
-    best, largest, single = None, -np.inf, -np.inf
+    best, largest = None, -np.inf
+    single = max((next(_noise(stars)) for stars in further), default=-np.inf)
     for stars, start in found:
         single = max(single, *_noise(stars))
         fit = _fitted(stars, start._replace(scales=weights), SCALES, PASSES)
+        # the same mixture about one centre, so that the noise is not only further from its maximum
+        middle = (1 - fit.share[0]) * fit.centre[:, :1] + fit.share[0] * fit.centre[:, 1:]
+        merged = fit._replace(centre=np.repeat(middle, 2, axis=1))
+        merged = _fitted(stars, merged, SCALES, PASSES, one_centre=True)
+        single = max(single, _elliptical(stars, merged, SCALES))
         likelihood = float(_log_density(stars, fit, SCALES).sum())
         if best is None or likelihood > largest:
             best, largest = (stars, fit), likelihood

@@ -166,7 +166,10 @@ NULL = {
     "cross": (cross, 0.04, None, lambda _, n: np.ones(n)),
 }
 # what matching or writing did to normal errors
-TREATED = ("cut at a radius", "cut at a radius, unequal errors", "rounded", "by magnitude")
+TREATED = (
+    *("two classes of errors", "cut at a radius", "cut at a radius, unequal errors"),
+    *("rounded", "by magnitude"),
+)
 
 
 def null_stars(name: str, rng: np.random.Generator, n: int) -> Matches:
@@ -183,6 +186,9 @@ def null_stars(name: str, rng: np.random.Generator, n: int) -> Matches:
             noise = noise + sigma[:, None] * gaussian(rng, n)
     elif name == "rounded":
         noise = np.round((true + noise) / 0.1) * 0.1 - true
+    elif name == "two classes of errors":  # the larger ones are quoted larger than they are
+        sigma = SIGMA * np.where(rng.uniform(size=n) < 0.3, 5.0, 1.0)
+        noise = noise + 0.5 * sigma[:, None] * gaussian(rng, n)
     elif name == "by magnitude":
         mag = rng.uniform(15.0, 20.0, n)
         sigma = of_magnitude(mag)
