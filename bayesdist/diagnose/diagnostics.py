@@ -24,11 +24,12 @@ from bayesdist.diagnose.holdout.validation import HoldoutValidation
 from bayesdist.diagnose.overlap import OverlapTest
 from bayesdist.diagnose.periods import PeriodSettings, TimeVariation, time_variation
 from bayesdist.diagnose.residuals.binned import BinnedSums, Coverage, coverage_of
-from bayesdist.diagnose.residuals.epoch_shift import EpochShift, epoch_shift
 from bayesdist.diagnose.residuals.misfit import (
     MAX_BINS,
     STARS_PER_BIN,
+    EpochShift,
     Misfit,
+    epoch_shift,
     explained_by_false_matches,
     majority_sentence,
     misfit_of,

@@ -28,7 +28,7 @@ MAX_CELLS = 24  # along each axis
 
 
 @dataclass(frozen=True, eq=False)
-class Alignment:
+class ExposureAlignment:
     """Similarity transformation between two exposures, and its residuals.
 
     The transformation is a = shift + scale R(rotation) b.
@@ -46,7 +46,7 @@ class Alignment:
         return np.sqrt(np.mean(self.residual**2, axis=0))
 
 
-def align(position_a: Float, position_b: Float) -> Alignment:
+def align(position_a: Float, position_b: Float) -> ExposureAlignment:
     """Fit shift, rotation and scale between positions (N, 2) of the same stars, in pixels.
 
     All stars have equal weight and none is clipped, as in `tweakwcs.fit_rscale`.
@@ -56,7 +56,7 @@ def align(position_a: Float, position_b: Float) -> Alignment:
     turn = complex(np.vdot(zb, za) / np.vdot(zb, zb))
     shift = complex(a.mean() - turn * b.mean())
     residual = a - shift - turn * b
-    return Alignment(
+    return ExposureAlignment(
         shift=np.array([shift.real, shift.imag]),
         rotation=float(np.angle(turn)),
         scale=abs(turn),
@@ -74,8 +74,8 @@ class OverlapTest:
     pa_v3: tuple[float, float]  # roll angles in degrees; NaN if unknown
     # old, new: alignment of the same stars with the distortion that the run started from, and with
     # the solution
-    old: Alignment
-    new: Alignment
+    old: ExposureAlignment
+    new: ExposureAlignment
     # binned_old, binned_new: over the common area of both exposures; axes (xi, eta), pixels
     binned_old: BinnedResiduals
     binned_new: BinnedResiduals
@@ -242,7 +242,7 @@ def _centred(plane: Float) -> Float:
 
 
 def _binned(
-    old: Alignment, new: Alignment
+    old: ExposureAlignment, new: ExposureAlignment
 ) -> tuple[tuple[float, float], BinnedResiduals, BinnedResiduals]:
     """Residuals in square cells over the common area of both exposures."""
     corner = new.position.min(axis=0)

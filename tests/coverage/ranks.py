@@ -26,9 +26,8 @@ from bayesdist.assess import Requirement
 from bayesdist.assess.domain import EvaluationDomain, field_statistic
 from bayesdist.diagnose.correlated import Discrepancy, DiscrepancyPriors
 from bayesdist.diagnose.correlated.exposure_fields import ExposureFields
-from bayesdist.diagnose.correlated.functions import StructureFunctions
 from bayesdist.diagnose.correlated.neighbours import LENGTHS as LENGTHS_OF
-from bayesdist.diagnose.correlated.priors import STRUCTURE_DOF
+from bayesdist.diagnose.correlated.priors import STRUCTURE_DOF, StructureFunctions
 from bayesdist.diagnose.correlated.structure import LENGTHS, UNLIKE
 from bayesdist.infer import OutlierMixture
 from bayesdist.model import Chip

@@ -8,7 +8,7 @@ from astropy.table import Table
 from scipy.spatial import cKDTree
 
 from bayesdist.data import Matches, find_similarity, pattern_index
-from bayesdist.diagnose.residuals.epoch_shift import epoch_shift
+from bayesdist.diagnose.residuals.misfit import epoch_shift
 from bayesdist.infer import build_model, fit_linear
 from tests.reduced import case_in_full, only_in_full
 

@@ -18,7 +18,6 @@ from bayesdist.data.matches import Matches
 from bayesdist.diagnose.correlated.deviations import linear_deviations
 from bayesdist.diagnose.correlated.exposure_fields import detection_scores, exposure_fields
 from bayesdist.diagnose.correlated.exposure_time import correlated_hierarchy
-from bayesdist.diagnose.correlated.functions import StructureFunctions
 from bayesdist.diagnose.correlated.information import (
     CellSums,
     Information,
@@ -32,7 +31,7 @@ from bayesdist.diagnose.correlated.neighbours import (
     SharedVariance,
     neighbour_scores,
 )
-from bayesdist.diagnose.correlated.priors import DiscrepancyPriors, log_half_t
+from bayesdist.diagnose.correlated.priors import DiscrepancyPriors, StructureFunctions, log_half_t
 from bayesdist.diagnose.correlated.result import ChipStructure, Discrepancy, structure_correlation
 from bayesdist.diagnose.correlated.structure import Structure, structure_posterior
 from bayesdist.diagnose.statistics import EfficientScore

@@ -18,7 +18,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.linalg
 
-from bayesdist.diagnose.correlated.functions import FINE, StructureFunctions, legendre_products
 from bayesdist.diagnose.correlated.information import (
     GroupCells,
     Information,
@@ -33,8 +32,11 @@ from bayesdist.diagnose.correlated.neighbours import (
     modes,
 )
 from bayesdist.diagnose.correlated.priors import (
+    FINE,
     STRUCTURE_DOF,
     DiscrepancyPriors,
+    StructureFunctions,
+    legendre_products,
     log_half_t,
     log_widths,
 )

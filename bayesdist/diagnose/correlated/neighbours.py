@@ -39,8 +39,8 @@ from scipy.spatial import cKDTree
 from scipy.special import j0
 
 from bayesdist.data.matches import Matches
-from bayesdist.diagnose.correlated.functions import legendre_products
 from bayesdist.diagnose.correlated.information import scores_on_chips
+from bayesdist.diagnose.correlated.priors import legendre_products
 from bayesdist.infer.stars.likelihood import Likelihood
 from bayesdist.infer.stars.stars import prepare
 from bayesdist.model import DistortionModel

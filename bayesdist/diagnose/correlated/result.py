@@ -12,7 +12,7 @@ from scipy.optimize import nnls
 
 from bayesdist.diagnose.correlated.deviations import LinearDeviations
 from bayesdist.diagnose.correlated.exposure_fields import ExposureFields
-from bayesdist.diagnose.correlated.functions import StructureFunctions
+from bayesdist.diagnose.correlated.priors import StructureFunctions
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.random import matern

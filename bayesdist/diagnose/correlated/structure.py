@@ -22,11 +22,13 @@ from typing import TypeVar
 
 import numpy as np
 
-from bayesdist.diagnose.correlated.functions import FINE, SHORTEST, StructureFunctions
 from bayesdist.diagnose.correlated.neighbours import SharedVariance
 from bayesdist.diagnose.correlated.priors import (
+    FINE,
+    SHORTEST,
     STRUCTURE_DOF,
     AmplitudeGrid,
+    StructureFunctions,
     log_half_t,
     log_widths,
 )

@@ -45,8 +45,7 @@ from bayesdist.calibration.calibration import Calibration, calibration_of
 from bayesdist.calibration.prior import CalibrationPrior, prior_of_calibration
 from bayesdist.data import Matches
 from bayesdist.diagnose.checks import frames_doubt
-from bayesdist.diagnose.residuals.epoch_shift import epoch_shift
-from bayesdist.diagnose.residuals.misfit import error_scale, majority_sentence
+from bayesdist.diagnose.residuals.misfit import epoch_shift, error_scale, majority_sentence
 from bayesdist.diagnose.residuals.stars import SAMPLE
 from bayesdist.errors import ConfigError, DegenerateError, InputError, NotSettledError
 from bayesdist.infer import (

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bayesdist.diagnose.correlated.functions import StructureFunctions
 from bayesdist.diagnose.correlated.information import Information, cell_sums
+from bayesdist.diagnose.correlated.priors import StructureFunctions
 from bayesdist.diagnose.correlated.result import ChipStructure, Discrepancy
 from bayesdist.diagnose.correlated.structure import structure_posterior
 from bayesdist.infer import GaussianPriors

@@ -9,8 +9,8 @@ from scipy.special import j0
 
 from bayesdist.calibration.chip_map import FurtherError
 from bayesdist.diagnose.correlated import Discrepancy, estimate_discrepancy
-from bayesdist.diagnose.correlated.functions import StructureFunctions, legendre_products
 from bayesdist.diagnose.correlated.neighbours import _below
+from bayesdist.diagnose.correlated.priors import StructureFunctions, legendre_products
 from bayesdist.utils.random import correlation_at, drawn_fields, matern
 
 from .skies import SIGMA, SIZE, Map, matched, scaled

@@ -12,8 +12,7 @@ from scipy.stats import t as student_t
 
 from bayesdist.diagnose.correlated import DiscrepancyPriors
 from bayesdist.diagnose.correlated.deviations import DeviationColumns, deviation_draws
-from bayesdist.diagnose.correlated.functions import StructureFunctions
-from bayesdist.diagnose.correlated.priors import STRUCTURE_DOF
+from bayesdist.diagnose.correlated.priors import STRUCTURE_DOF, StructureFunctions
 from bayesdist.diagnose.correlated.structure import LENGTHS, structure_posterior
 from tests.infer.by_nuts import needs_numpyro, nuts_draws
 from tests.reduced import only_in_full

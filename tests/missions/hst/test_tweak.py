@@ -16,7 +16,7 @@ import pytest
 
 from bayesdist.calibration.calibration import Calibration, calibration_of
 from bayesdist.data.sky import mean_direction, tangent_plane
-from bayesdist.diagnose.overlap import Alignment, align
+from bayesdist.diagnose.overlap import ExposureAlignment, align
 from bayesdist.missions.hst.release import Period, write_release
 from bayesdist.missions.hst.simulate.making import detector_tables, filter_tables
 from bayesdist.model.lookup import LookupTable, corrected
@@ -107,7 +107,7 @@ def field(calibration):
 
 
 @pytest.fixture(scope="module")
-def aligned(calibration, field, tmp_path_factory) -> dict[str, Alignment]:
+def aligned(calibration, field, tmp_path_factory) -> dict[str, ExposureAlignment]:
     """Residuals with the new files, and with the old: no drift, no tables."""
     pytest.importorskip("stwcs")
     solution, o, tables, _ = calibration
@@ -154,7 +154,7 @@ def sky_of(wcs: Mapping[int, Any], exposure: Exposure) -> np.ndarray:
     return out
 
 
-def vectors(alignment: Alignment, sigma: np.ndarray, cells: int = 8):
+def vectors(alignment: ExposureAlignment, sigma: np.ndarray, cells: int = 8):
     """Weighted mean residual in each cell of the overlap (M, 2), and its error (M,)."""
     p = alignment.position
     edges = [np.quantile(p[:, k], np.linspace(0, 1, cells + 1)[1:-1]) for k in (0, 1)]
@@ -198,7 +198,7 @@ def test_old_files_leave_a_pattern(aligned, field) -> None:
     new, _ = vectors(aligned["new"], sigma)
     assert np.hypot(*new.T).max() < largest / 5
 
-    def shared(alignment: Alignment) -> float:
+    def shared(alignment: ExposureAlignment) -> float:
         """Correlation of the residuals of nearest neighbours."""
         from scipy.spatial import cKDTree
 

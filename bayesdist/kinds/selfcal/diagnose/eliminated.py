@@ -28,7 +28,6 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from bayesdist.diagnose.correlated.deviations import DeviationColumns, deviation_columns
-from bayesdist.diagnose.correlated.functions import StructureFunctions
 from bayesdist.diagnose.correlated.information import (
     MAX_BLOCKS,
     MIN_FREE,
@@ -36,6 +35,7 @@ from bayesdist.diagnose.correlated.information import (
     SquaredScores,
     block_ratios,
 )
+from bayesdist.diagnose.correlated.priors import StructureFunctions
 from bayesdist.diagnose.statistics import EfficientScore, sums_over
 from bayesdist.infer.equations.scaled import determined
 from bayesdist.kinds.selfcal.infer.calibrate import MOST_TAKEN

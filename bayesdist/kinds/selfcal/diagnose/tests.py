@@ -32,9 +32,8 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from bayesdist.diagnose.correlated.deviations import QUADRATIC, deviation_draws
-from bayesdist.diagnose.correlated.functions import MIN_SIDE, StructureFunctions
 from bayesdist.diagnose.correlated.information import not_narrower
-from bayesdist.diagnose.correlated.priors import DiscrepancyPriors
+from bayesdist.diagnose.correlated.priors import MIN_SIDE, DiscrepancyPriors, StructureFunctions
 from bayesdist.diagnose.correlated.result import (
     ChipStructure,
     Discrepancy,

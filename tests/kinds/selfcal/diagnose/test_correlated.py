@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bayesdist.diagnose.correlated.deviations import deviation_columns
-from bayesdist.diagnose.correlated.functions import StructureFunctions
+from bayesdist.diagnose.correlated.priors import StructureFunctions
 from bayesdist.infer.equations.priors import Prior
 from bayesdist.kinds.selfcal.diagnose.eliminated import (
     AddedColumns,
