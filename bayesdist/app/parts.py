@@ -18,7 +18,7 @@ from bayesdist.data.matches import Matches
 from bayesdist.diagnose.tables import BetweenNodes
 from bayesdist.errors import InputError
 from bayesdist.files.faults import restoring
-from bayesdist.files.records import read_record, write_record
+from bayesdist.files.hdf5 import read_record, write_record
 from bayesdist.infer import (
     GaussianPriors,
     LinearFit,

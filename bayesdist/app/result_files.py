@@ -29,7 +29,7 @@ from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.diagnose.residuals.misfit import Misfit
 from bayesdist.diagnose.score.result import ScoreTest
 from bayesdist.errors import FormatError, InputError, required
-from bayesdist.files.records import read_record, write_record
+from bayesdist.files.hdf5 import read_record, write_record
 from bayesdist.infer import LinearFit, Posterior
 from bayesdist.products.maps_file import write_maps
 from bayesdist.utils.checks import warnings_of

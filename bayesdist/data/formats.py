@@ -25,7 +25,7 @@ from bayesdist.data.tables.column import TableColumns
 from bayesdist.data.tables.names import origin_of
 from bayesdist.data.tables.parquet import describe_part
 from bayesdist.errors import FormatError, InputError
-from bayesdist.files.records import read_record, write_record
+from bayesdist.files.hdf5 import read_record, write_record
 from bayesdist.files.tables import TABLE_SUFFIXES, is_binary, is_fits, read_table
 from bayesdist.files.text_tables import is_text_table
 from bayesdist.files.unpacked import read_lines, without_codec

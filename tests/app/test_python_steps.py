@@ -17,7 +17,7 @@ from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess import Catalogue, UserTerm, check_requirements, error_budget
 from bayesdist.assess.assessment import MISSING_TERMS
 from bayesdist.diagnose.diagnostics import diagnose
-from bayesdist.files.records import record_to_arrays
+from bayesdist.files.hdf5 import record_to_arrays
 from tests.adversarial import KINDS
 from tests.adversarial.measure import assessed
 from tests.adversarial.python_face import carried

@@ -13,7 +13,7 @@ import pytest
 
 from bayesdist.assess import Requirement
 from bayesdist.errors import FormatError, InputError
-from bayesdist.files.records import (
+from bayesdist.files.hdf5 import (
     read_record,
     record_from_arrays,
     record_to_arrays,

@@ -30,7 +30,7 @@ from typing import Any, Concatenate, Generic, cast
 
 from bayesdist.data.matches import Matches
 from bayesdist.errors import FormatError, InputError
-from bayesdist.files.records import read_record, write_record
+from bayesdist.files.hdf5 import read_record, write_record
 from bayesdist.infer import kernel
 from bayesdist.infer.stars.shards import (
     BRANCHES,

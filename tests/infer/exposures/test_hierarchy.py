@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 from bayesdist.errors import DegenerateError, InputError
-from bayesdist.files.records import record_from_arrays, record_to_arrays
+from bayesdist.files.hdf5 import record_from_arrays, record_to_arrays
 from bayesdist.infer import GaussianPriors, OutlierMixture, Rejection, fit_linear, sample
 from bayesdist.infer.equations.arrow import Arrow
 from bayesdist.infer.exposures.alone import fit_exposures

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from bayesdist.errors import InputError
-from bayesdist.files.records import write_record
+from bayesdist.files.hdf5 import write_record
 from bayesdist.infer import Compute
 from bayesdist.infer.equations.priors import Prior
 from bayesdist.infer.stars import cluster as cluster_module
