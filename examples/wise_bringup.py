@@ -8,8 +8,7 @@ import numpy as np
 
 from bayesdist.missions.wise.bring_up import bring_up
 from bayesdist.missions.wise.pairs.section import RadialLimit
-from bayesdist.missions.wise.simulate.bringup import simulate_unpaired
-from bayesdist.missions.wise.simulate.optical import optical_model
+from bayesdist.missions.wise.simulate.bringup import optical_model, simulate_unpaired
 
 STARTS = {
     "from nothing": None,

@@ -20,7 +20,7 @@ from typing import Any
 
 import click
 
-from bayesdist.app.commands.options import LazyGroup
+from bayesdist.app.commands.options import COMMANDS, LazyGroup
 from bayesdist.app.screen import open_streams
 from bayesdist.errors import BayesdistError, BayesdistWarning, RenamedError
 from bayesdist.files.faults import InterruptHandler, installed_handler, raising_interrupts
@@ -34,7 +34,6 @@ SELDOM = 50_000, 20, 100
 # commands use threads on all cores, which threads of the linear algebra would only slow down
 ALGEBRA = "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS"
 INTERRUPTED, TERMINATED = 130, 143  # 128 and the number of the signal, as in a shell
-COMMANDS = "bayesdist.app.commands"
 CORE = {
     name: f"{COMMANDS}.{module}:{name.replace('-', '_')}"
     for module, names in {

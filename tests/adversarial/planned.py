@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from bayesdist.app.commands.on_runs.plan import content_of, futures_of, schedules_of
+from bayesdist.app.commands.plan import content_of, futures_of, schedules_of
 from bayesdist.app.evaluating import margins_of_run
 from bayesdist.app.run import Run
 from bayesdist.assess import Requirement

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import kstest
 
-from bayesdist.app.commands.on_runs.plan import content_of, needs_of
+from bayesdist.app.commands.plan import content_of, needs_of
 from tests.reduced import case_in_full, only_in_full
 
 from .measure import assessed

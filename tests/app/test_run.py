@@ -24,7 +24,7 @@ from astropy.table import Table
 from astropy.wcs import WCS, FITSFixedWarning
 
 import bayesdist
-from bayesdist.app.commands.on_runs.budget import exit_code
+from bayesdist.app.commands.budget import exit_code
 from bayesdist.app.config import load_config, parse_config
 from bayesdist.app.screen import progress_bar
 from bayesdist.app.store.rundir import RunDirectory

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from astropy.io.fits import FITSDiff
+from astropy.table import Table
 
 from bayesdist.app.store.record import FileMark, Record
 from bayesdist.app.store.rundir import RunDirectory
@@ -19,7 +20,10 @@ from bayesdist.files.atomic import path_within
 from bayesdist.files.hdf5 import netcdf_groups
 from bayesdist.infer import load_fit
 from tests.app.support import EXACT, cli, good, refused, snapshot, write_config, write_job
+from tests.kills.compare import assert_same
+from tests.kills.jobs import JOBS
 from tests.reduced import case_in_full
+from tests.sketches import quick
 
 pytestmark = pytest.mark.usefixtures("no_report")
 
@@ -266,3 +270,33 @@ def test_inspect_describes_the_fit_of_a_run(finished):
     fit = load_fit(finished.path / "fit.nc")
     assert "linear fit" in text and f"{fit.n_used} stars" in text
     assert all(name in text for name in fit.model.names)
+
+
+def _without_an_exposure_time(folder) -> None:
+    """Remove one, of which a warning names the file."""
+    path = folder / "exposures.ecsv"
+    exposures = Table.read(path)
+    exposures["exptime"][1] = float("nan")
+    exposures.write(path, overwrite=True)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "job", ["matches", "campaign", case_in_full("selfcal", instead="two other kinds")]
+)
+def test_run_in_two_folders(job, tmp_path):
+    first, second = tmp_path / "one", tmp_path / "another" / "and_longer"
+    config = JOBS[job](first).relative_to(first)
+    if job == "campaign":
+        _without_an_exposure_time(first)
+    shutil.copytree(first, second)
+    for folder in (first, second):
+        with quick():
+            good("run", folder / config, "-o", folder / "run", "-q")
+    assert_same(first / "run", second / "run")
+    for path in (first / "run").rglob("*"):
+        if path.is_file() and not re.fullmatch(r"bayesdist\.log|run\.json", path.name):
+            assert str(tmp_path).encode() not in path.read_bytes(), path
+    if job == "campaign":
+        summary = (first / "run" / "summary.json").read_text(encoding="utf-8")
+        assert "exptime is missing of 1 of 6 exposures in exposures.ecsv" in summary

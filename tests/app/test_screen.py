@@ -85,7 +85,7 @@ def test_a_run_begins_without_what_only_a_stage_or_a_few_runs_need():
         *("emcee", "jinja2", "matplotlib", "pandas", "pyarrow", "scipy.stats", "xarray"),
     )
     code = f"""
-import sys, bayesdist.app.stages, bayesdist.app.commands.on_runs.check
+import sys, bayesdist.app.stages, bayesdist.app.commands.check
 print([m for m in {heavy!r} if m in sys.modules])
 """
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -9,7 +9,7 @@ import pytest
 from astropy.io import fits
 from astropy.table import MaskedColumn, Table
 
-from bayesdist.app.commands.on_files.inputs import fits_table
+from bayesdist.app.commands.inputs import fits_table
 from bayesdist.calibration.chip_map import FurtherError
 from bayesdist.errors import InputError
 from bayesdist.files.atomic import LONGEST_NAME, refuse_unsafe_name

@@ -1,1 +1,4 @@
-"""Commands of the core: short functions with their options, which import code when needed."""
+"""Commands of the core: `runs` and `files` declare them; the other modules do the work.
+
+The other modules are imported when their commands are called.
+"""

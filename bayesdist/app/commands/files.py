@@ -13,8 +13,7 @@ import click
 
 import bayesdist.version
 from bayesdist.app.commands.options import (
-    ON_FILES,
-    ON_RUNS,
+    COMMANDS,
     Unused,
     command,
     epoch,
@@ -32,7 +31,7 @@ _PACKAGE = Path(bayesdist.version.__file__).parent
 _FOLDERS = (_PACKAGE / "docs", _PACKAGE.parent / "docs")  # installed, and in the source tree
 
 
-@command(calls=f"{ON_FILES}.inspect:inspect")
+@command(calls=f"{COMMANDS}.inspect:inspect")
 @click.argument("path", metavar="FILE", type=click.Path())
 def inspect() -> None:
     """Describe a product, a posterior or a run, and report its faults."""
@@ -127,11 +126,11 @@ def apply(file: str, table: str, output: str, **options: Any) -> None:
     origin = options.pop("pixel_origin")
     origin = None if origin is None else float(origin)
     if not options.pop("sky"):
-        from bayesdist.app.commands.on_files.apply import apply_to_table
+        from bayesdist.app.commands.apply import apply_to_table
 
         click.echo(apply_to_table(file, table, output, pixel_origin=origin, **options))
         return
-    from bayesdist.app.commands.on_files.apply import sky_to_table
+    from bayesdist.app.commands.apply import sky_to_table
 
     shared = ("columns", "chip", "filter", "epoch", "size", "force")
     common_options = {key: options.pop(key) for key in shared}
@@ -140,7 +139,7 @@ def apply(file: str, table: str, output: str, **options: Any) -> None:
     )
 
 
-@command(calls=f"{ON_FILES}.convert:convert")
+@command(calls=f"{COMMANDS}.convert:convert")
 @click.argument("path", metavar="FILE", type=click.Path())
 @click.option("--to", required=True, metavar="FORMAT", help="Format to write, a key of [products].")
 @click.option(
@@ -181,7 +180,7 @@ def convert() -> None:
     """
 
 
-@command(calls=f"{ON_RUNS}.compare:compare_files", recorded=True)
+@command(calls=f"{COMMANDS}.compare:compare_files", recorded=True)
 @click.argument("a", metavar="A", type=click.Path())
 @click.argument("b", metavar="B", type=click.Path())
 @click.option(
@@ -217,7 +216,7 @@ def compare() -> None:
     """
 
 
-@command(calls=f"{ON_RUNS}.monitor:monitor", recorded=True)
+@command(calls=f"{COMMANDS}.monitor:monitor", recorded=True)
 @click.argument("run", metavar="RUN", type=click.Path())
 @click.argument("new", metavar="NEW", type=click.Path())
 @click.option(

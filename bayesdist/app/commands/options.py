@@ -231,7 +231,7 @@ def command(
     return decorated
 
 
-ON_FILES, ON_RUNS = "bayesdist.app.commands.on_files", "bayesdist.app.commands.on_runs"
+COMMANDS = "bayesdist.app.commands"
 column_names = _ColumnNames()
 new_folder = click.option(
     "-o", "--output", type=click.Path(), required=True, metavar="DIR", help="Folder to create."

@@ -7,12 +7,12 @@ from typing import Any
 
 import click
 
-from bayesdist.app.commands.options import ON_RUNS, CommaList, Unused, command, force
+from bayesdist.app.commands.options import COMMANDS, CommaList, Unused, command, force
 
 STAGES = ("match", "fit", "sample", "diagnose", "evaluate", "assess", "export", "report")
 
 
-@command(calls=f"{ON_RUNS}.check:check")
+@command(calls=f"{COMMANDS}.check:check")
 @click.argument("path", metavar="CONFIG.toml", type=click.Path())
 def check() -> None:
     """Check units, rank, degeneracies and cost of a configuration, without sampling."""
@@ -89,7 +89,7 @@ def requirements(run: str, requirements: str) -> int:
     The exit code is 4 if a requirement is missed, otherwise 6 if one is undecided because something
     is in doubt, otherwise 5 if one is not shown to be met.
     """
-    from bayesdist.app.commands.on_runs.budget import validate
+    from bayesdist.app.commands.budget import validate
 
     text, code = validate(run, requirements)
     click.echo(text)
@@ -97,7 +97,7 @@ def requirements(run: str, requirements: str) -> int:
 
 
 @command(
-    calls=f"{ON_RUNS}.budget:budget_at",
+    calls=f"{COMMANDS}.budget:budget_at",
     unused=[
         Unused("to", "with --at-table", lambda o: o["at_table"] is not None, "give --at"),
         Unused("columns", "without --at-table", lambda o: o["at_table"] is None),
@@ -163,7 +163,7 @@ def report(runs: tuple[str, ...], output: str | None) -> None:
     click.echo(overview(runs, output or "reports.html"))
 
 
-@command(calls=f"{ON_RUNS}.plan:plan")
+@command(calls=f"{COMMANDS}.plan:plan")
 @click.argument("run", metavar="RUN", type=click.Path())
 @click.option(
     "--requirement", "name", metavar="NAME", show_default="all", help="Name of one requirement."
@@ -180,7 +180,7 @@ def plan() -> None:
 
 
 @command(
-    calls=f"{ON_RUNS}.plan:order",
+    calls=f"{COMMANDS}.plan:order",
     name="select-order",
     unused=[
         Unused(

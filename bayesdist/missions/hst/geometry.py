@@ -17,7 +17,7 @@ import numpy as np
 from astropy.table import Table
 from matplotlib.figure import Figure
 
-from bayesdist.app.commands.on_files.inputs import calibration_of_scale, images_of, notes_of
+from bayesdist.app.commands.inputs import calibration_of_scale, images_of, notes_of
 from bayesdist.app.run import Run
 from bayesdist.app.screen import number, table_text
 from bayesdist.app.store.record import record_folder, refuse_existing, write_table

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from astropy.table import QTable
 
-from bayesdist.app.commands.on_files.convert import convert
+from bayesdist.app.commands.convert import convert
 from bayesdist.app.result_files import results_text
 from bayesdist.app.run import Run
 from bayesdist.app.screen import number, table_text
@@ -26,7 +26,7 @@ from bayesdist.errors import InputError
 from bayesdist.files.atomic import made_folder
 from bayesdist.infer import LinearFit, Posterior
 from bayesdist.missions.wise.simulate import WiseSet, simulate_wise, wise_set, write_wise_set
-from bayesdist.missions.wise.simulate.optical import DELIVERED_TURN, write_optical_model
+from bayesdist.missions.wise.simulate.bringup import DELIVERED_TURN, write_optical_model
 from bayesdist.simulate import Truth
 
 SEED = 20110201  # date of the report from which the coefficients are taken

@@ -17,8 +17,11 @@ from bayesdist.missions.wise.bring_up import bring_up
 from bayesdist.missions.wise.pairs.read import read_rvb
 from bayesdist.missions.wise.pairs.section import RadialLimit
 from bayesdist.missions.wise.simulate import wise_solution
-from bayesdist.missions.wise.simulate.bringup import simulate_unpaired
-from bayesdist.missions.wise.simulate.optical import optical_model, write_optical_model
+from bayesdist.missions.wise.simulate.bringup import (
+    optical_model,
+    simulate_unpaired,
+    write_optical_model,
+)
 from bayesdist.model import Chip, DistortionModel
 from tests.app.support import good, refused
 from tests.reduced import case_in_full

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bayesdist.app.commands.on_files.convert import convert
+from bayesdist.app.commands.convert import convert
 from bayesdist.infer import save_fit
 from bayesdist.missions.wise.simulated_pairs import FILES, SCALES
 from bayesdist.products.registry import lint, read_calibration

@@ -10,7 +10,7 @@ import pytest
 from astropy.table import Table
 from scipy import stats
 
-from bayesdist.app.commands.on_runs.check import check
+from bayesdist.app.commands.check import check
 from bayesdist.data import read_matches
 from bayesdist.errors import InputError
 from bayesdist.infer import Rejection, fit_linear

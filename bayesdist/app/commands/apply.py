@@ -13,7 +13,7 @@ from astropy.io import fits
 from astropy.table import QTable, Table
 
 from bayesdist.app.calibrations import calibration_at, on_the_sky, refuse_unused_date
-from bayesdist.app.commands.on_files.inputs import (
+from bayesdist.app.commands.inputs import (
     OUT,
     add_positions,
     calibration_of_scale,

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.app.commands.on_runs.compare import joined
+from bayesdist.app.commands.compare import joined
 from bayesdist.app.config import Config, load_config
 from bayesdist.app.kind import RunKind
 from bayesdist.app.run import Run

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from bayesdist.app.commands.on_files.inputs import origin_line, read_positions
+from bayesdist.app.commands.inputs import origin_line, read_positions
 from bayesdist.app.config import load_requirements
 from bayesdist.app.evaluating import idle_dates, margins_of_run, validity_periods_of_run
 from bayesdist.app.result_files import margin_rows, margins_text, reasons_of, save_margins

@@ -1,1 +1,0 @@
-"""Commands on files: transformations, content, initial configuration."""
