@@ -56,6 +56,7 @@ IN_COVARIANCE = (
 )
 
 REHEARSED_SIGMA = 1e-3  # pixels: assumed error of each coefficient, because files state errors
+FALSE = 0.5  # outlier probability above which a match counts as false
 
 Entry = dict[str, Any]  # of a file in summary.json: path, kind, findings and others
 
@@ -173,9 +174,6 @@ def _compare(product: dict[str, Any], budget: Sequence[BudgetEntry]) -> None:
                     f"warning: forward: differs from the solution by {row['radial']:.2g} rms over "
                     f"the detector, whose total error is {total:.2g}"
                 )
-
-
-FALSE = 0.5  # outlier probability above which a match counts as false
 
 
 def sky_closure(

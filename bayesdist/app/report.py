@@ -7,7 +7,7 @@ import os
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 from bayesdist.app.calibrations import difference_from_previous
@@ -19,8 +19,10 @@ from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.store.summary import head_of
 from bayesdist.assess.comparison.compare import Comparison
 from bayesdist.files.atomic import atomic_path
-from bayesdist.report.run_report import OverviewRow, write_overview
 from bayesdist.utils.text import with_mas
+
+if TYPE_CHECKING:
+    from bayesdist.report.run_report import OverviewRow
 
 log = logging.getLogger("bayesdist")
 
@@ -84,6 +86,8 @@ def comparison_with_previous(run: Run) -> tuple[Comparison, ...]:
 
 def overview(runs: Sequence[str | Path], output: str | Path) -> str:
     """Write a page that compares runs by their summary.json, and return the text to print."""
+    from bayesdist.report.run_report import write_overview
+
     rows = [_row(RunDirectory(run), Path(output)) for run in runs]
     table = [
         {"Status": row.level.replace("fail", "FAIL"), "Run": row.name, "Verdict": row.headline}
@@ -93,6 +97,8 @@ def overview(runs: Sequence[str | Path], output: str | Path) -> str:
 
 
 def _row(run: RunDirectory, output: Path) -> OverviewRow:
+    from bayesdist.report.run_report import OverviewRow
+
     if not run.is_initialized:
         raise run.not_a_run_error()
     summary, head = run.summary, head_of(run.facts)

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from bayesdist.diagnose.residuals.binned import BinnedResiduals
     from bayesdist.infer import LinearFit, Posterior
     from bayesdist.infer.catalogue.added_errors import GroupedErrors
-    from bayesdist.model import Chip, DistortionModel, LookupTable
+    from bayesdist.model import DistortionModel, LookupTable
 
 Size = tuple[float, float]
 

@@ -35,6 +35,7 @@ from bayesdist.infer import Posterior
 from bayesdist.version import __version__
 
 SCHEMA = 2
+TABLE_SCHEMA = 1  # of records of commands
 PACKAGES = ("arviz-stats", "astropy", "emcee", "h5py", "numba", "numpy", "scipy")
 
 
@@ -406,9 +407,6 @@ def provenance_notes(posterior: Posterior, gauge: str) -> dict[str, bool | str]:
         "converged": posterior.convergence.converged,
         **({"gauge": gauge} if gauge else {}),
     }
-
-
-TABLE_SCHEMA = 1  # of records of commands
 
 
 @contextmanager

@@ -64,12 +64,15 @@ from bayesdist.model.grid import grid_pixels, mesh
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.checks import TREND
 
+log = logging.getLogger("bayesdist")
+
 SERIES = ("A_2", "A_3", "B_1", "B_2", "B_3")
 
 MIN_SCATTER_RATIO = 2.0  # ratio of scatters above which centroid errors cannot explain them
 MIN_EXPLAINED = 0.5  # fraction of the variance of the scatters explained by the dates
 MIN_EXPOSURES = 5  # exposures: a parabola in time has three parameters
 SIGMA_OF_MEDIAN = 1.4826  # standard deviation in units of the median absolute deviation
+ROUGH_ITERATIONS = 1  # iterations of the tables that are used only to estimate star errors
 
 
 def fit_campaign(run: Run) -> Run:
@@ -198,11 +201,6 @@ def refuse_outrun_stars(inputs: CampaignInputs, fit: LinearFit, pairs: Matches) 
         where=inputs.catalog.source,
         do="give it columns pm_u and pm_v, or calibrate exposures of one epoch",
     )
-
-
-log = logging.getLogger("bayesdist")
-
-ROUGH_ITERATIONS = 1  # iterations of the tables that are used only to estimate star errors
 
 
 def fit_tables(
