@@ -160,7 +160,7 @@ def _simulate(setting: Setting, seed: int, folder: Path) -> None:
             making = f"{simulate}.making."
             stack.enter_context(mock.patch(making + "detector_tables", _random_field))
             stack.enter_context(mock.patch(making + "filter_tables", return_value=()))
-        stack.enter_context(mock.patch(f"{simulate}.pointings.OWN", setting.own))
+        stack.enter_context(mock.patch(f"{simulate}.truth.OWN", setting.own))
         options = ["--exposures", setting.exposures, "--stars", setting.stars, "--seed", seed]
         options += ["--no-tables"] if setting.pattern == "none" else []
         good("simulate", "acs", "-o", folder, *options, "-q")

@@ -25,7 +25,7 @@ from functools import partial
 
 import numpy as np
 
-from bayesdist.diagnose.score.groups import GROUP_DOF, DisplacedGroup, displaced_group
+from bayesdist.diagnose.score.groups import GROUP_DOF, MAX_STARS, DisplacedGroup, displaced_group
 from bayesdist.diagnose.score.missing_orders import MIN_STARS, ChipResiduals, legendre_products
 from bayesdist.diagnose.score.result import DISPLACED_GROUP, POWER, Family, Outcome, outcome
 from bayesdist.diagnose.score.sample import ScoredSample
@@ -322,8 +322,8 @@ def _displaced_group(
     if not chips:
         return None
     typical = float(np.median([chip.sigma for chip in chips]))
-    n = sum(chip.n_stars for chip in chips)
-    smallest = partial(_smallest_group, typical, n)
+    n_stars = min(sum(chip.n_stars for chip in chips), MAX_STARS)  # that are examined
+    smallest = partial(_smallest_group, typical, n_stars)
     if group is None:
         return Outcome(GROUP_OF_STARS, 0.0, GROUP_DOF, None, 1.0, 0.0, smallest, unit)
     remedy = GROUP_OF_STARS.remedy + (CUT_ELSEWHERE if cut else "")

@@ -324,7 +324,10 @@ class Survey:
     groups: Groups  # without members
     exposures: Int  # number (E,) of stars in each exposure of the model
     chips: tuple[ChipSurvey, ...]  # in the order of the model's chips
-    variance: tuple[Float, ...]  # evenly spaced samples of the squared errors of both axes
+    # evenly spaced samples of the squared errors of both axes, and True where the motion of the
+    # star is measured
+    variance: tuple[Float, ...]
+    measured: tuple[Bool, ...]
     sources: tuple[str, ...]  # names of the files
     # largest distance of a star from its nominal position, and the name of the star; the distance
     # is negative if nominal positions are unknown
@@ -337,6 +340,7 @@ class Survey:
             self.exposures + other.exposures,
             tuple(a + b for a, b in zip(self.chips, other.chips, strict=True)),
             self.variance + other.variance,
+            self.measured + other.measured,
             self.sources,
             max(self.farthest, other.farthest, key=lambda one: one[0]),
         )
@@ -345,9 +349,11 @@ class Survey:
     def reference_sigma(self) -> float:
         """Median quoted error per axis, in the unit of u and v; the scale of the priors.
 
-        Stars whose motion is assumed are left out.
+        Stars whose motion is assumed are left out, unless there are no others: their errors are no
+        scale of those of the others.
         """
-        return float(np.sqrt(np.median(np.concatenate(self.variance))))
+        variance, measured = np.concatenate(self.variance), np.concatenate(self.measured)
+        return float(np.sqrt(np.median(variance[measured] if measured.any() else variance)))
 
     def check_circle(self, radius: float | None) -> None:
         """Raise InputError if a star is outside its match circle.
@@ -371,14 +377,13 @@ class Survey:
         return ", ".join(self.sources)
 
 
-def survey(stars: Stars, matches: Matches, every: int, measured: Bool) -> Survey:
+def survey(stars: Stars, matches: Matches, every: int, measured: Bool | None = None) -> Survey:
     """Survey of a chunk of the data.
 
-    The errors of every `every`-th star with a measured motion are sampled: those of assumed motions
-    are no scale of the other errors.  `measured` (N,) is in the order of `stars`; if it is True for
-    no star, the errors of all are sampled.
+    The errors of every `every`-th star are sampled.  `measured` (N,), in the order of `stars`, is
+    True for those whose motion is not assumed; by default all of them.
     """
-    if not measured.any():
+    if measured is None:
         measured = np.ones(len(stars), bool)
     model = stars.model
     numbers = matches.chip_number
@@ -408,7 +413,8 @@ def survey(stars: Stars, matches: Matches, every: int, measured: Bool) -> Survey
             : len(model.exposures)
         ],
         chips=tuple(chips),
-        variance=tuple(variance[measured][::every] for variance in stars.variances()),
+        variance=tuple(variance[::every] for variance in stars.variances()),
+        measured=2 * (measured[::every],),
         sources=matches.sources,
         farthest=_farthest(matches),
     )

@@ -259,10 +259,13 @@ def test_a_budget_that_is_no_budget_is_refused(memory):
         Compute(memory_mb=memory)
 
 
-def test_the_scale_of_priors_is_that_of_stars_with_a_measured_motion(monkeypatch):
-    """With 60 % of assumed motions, in any order and in several pieces."""
+@pytest.mark.parametrize("in_order", [False, True], ids=["mixed", "assumed motions last"])
+def test_the_scale_of_priors_is_that_of_stars_with_a_measured_motion(monkeypatch, in_order):
+    """With 60 % of assumed motions, in several pieces, some of which may have no others."""
     rng, n = np.random.default_rng(12), 600
     assumed = rng.random(n) < 0.6
+    if in_order:
+        assumed = np.sort(assumed)
     model, matches, _ = simulated(12, n, chips=TWO_CHIPS, frames="shift_rotation", n_exposures=4)
     sigma = np.where(assumed, 2.0, rng.uniform(0.02, 0.06, n))
     marked = matches.with_errors((sigma, sigma)).with_columns(assumed_motion=assumed.astype(int))
