@@ -91,7 +91,7 @@ def monitor(
             ),
             pixel_mas=pixel_scale_of(posterior, scale_mas=config.detector.scale_mas),
         )
-        facts = _facts(fitted, posterior)
+        facts = _facts(fitted, posterior) | _planes(posterior, matches)
         facts |= {"left_out": list(left_out), "rejected": dict(matches.rejected)}
     finally:
         fitted.target.shards.close()
@@ -212,6 +212,15 @@ def _facts(new: NewFit, posterior: Posterior) -> dict[str, Any]:
     }
 
 
+def _planes(posterior: Posterior, matches: Matches) -> dict[str, Any]:
+    """Tangent points of the new matches and of the release, RA and Dec in degrees, or None."""
+    points = {
+        "tangent_point": matches.tangent_point,
+        "tangent_point_released": posterior.tangent_point,
+    }
+    return {name: None if point is None else list(point) for name, point in points.items()}
+
+
 def _lines(found: Monitored, facts: dict[str, Any], scores: Sequence[PeriodScore]) -> list[str]:
     """Lines of text below the verdict."""
     frames = "nothing" if facts["frames"] == "none" else facts["frames"].replace("_", ", ")
@@ -221,6 +230,17 @@ def _lines(found: Monitored, facts: dict[str, Any], scores: Sequence[PeriodScore
     ]
     if facts["deviating"]:
         lines.append("exposures deviate as those of the release scatter")
+    point, released = facts["tangent_point"], facts["tangent_point_released"]
+    if point is not None and released is not None and point != released:
+        lines.append(
+            f"the tangent point of the new matches is {point}, that of the release {released}"
+        )
+    elif (point is None) != (released is None):
+        side = "the new matches" if point is None else "the release"
+        lines.append(
+            f"u and v of {side} state no tangent point and are taken to have that of the other "
+            f"side, {point or released}"
+        )
     if facts["left_out"]:
         names = facts["left_out"]
         ellipsis = "" if len(names) < 4 else ", ..."

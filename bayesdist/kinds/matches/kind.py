@@ -6,7 +6,7 @@ The prior may be an earlier calibration.
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import cast
@@ -59,8 +59,13 @@ from bayesdist.infer.catalogue.added_errors import GroupedErrors, grouped_errors
 from bayesdist.infer.exposures.frame_choice import frames_that_help
 from bayesdist.infer.solution.geometry import geometries, refuse_geometry
 from bayesdist.infer.solution.linear import Rejection
-from bayesdist.kinds.matches.config import MatchesConfig
-from bayesdist.kinds.matches.sources import read_configured, source_of
+from bayesdist.kinds.matches.config import Data, MatchesConfig
+from bayesdist.kinds.matches.sources import (
+    read_configured,
+    read_on_plane,
+    refuse_other_plane,
+    source_of,
+)
 from bayesdist.model import DistortionModel
 from bayesdist.products.registry import read_calibration
 from bayesdist.utils.checks import LARGER, Check
@@ -130,7 +135,14 @@ class MatchesKind(RunKind[MatchesConfig, Matches]):
         """New matches, read as the section [data] states."""
         data = config.data if dated else config.data.model_copy(update={"epoch": None})
         chips = release.config.chip or config.chip
-        matches = read_configured(files, data, size=config.detector.size, chips=chips)
+
+        def read(data: Data) -> Matches:
+            return read_configured(files, data, size=config.detector.size, chips=chips)
+
+        if release.kind.new_frames is None:
+            matches = _on_plane_of_release(release, data, read)
+        else:
+            matches = read(data)
         if data.sigma != "by_magnitude":
             return matches
         errors = load_errors(release.directory.path).by_magnitude
@@ -151,6 +163,26 @@ class MatchesKind(RunKind[MatchesConfig, Matches]):
         return self.fit(run).errors if config.data.sigma == "by_magnitude" else QUOTED
 
 
+def _on_plane_of_release(release: Run, data: Data, read: Callable[[Data], Matches]) -> Matches:
+    """New matches on the tangent plane of a run.
+
+    Raises InputError if only the new matches have a tangent point, which the configuration does not
+    state, or if there is another difference that `refuse_other_plane` refuses.
+    """
+    earlier = calibration_of(release.solution, str(release.directory.path))
+    frames = release.solution.model.frames
+    matches = read_on_plane(earlier, data, read, frames=frames)
+    unknown = release.solution.tangent_point is None and frames in ("none", "shift")
+    chosen = matches.tangent_point is not None and data.tangent_point is None
+    if unknown and chosen and matches.unit == earlier.unit:
+        raise InputError(
+            f"the positions are RA and Dec, but u and v of {earlier.name} state no tangent point",
+            where=", ".join(matches.sources),
+            do="give a configuration whose data.tangent_point is that of u and v of the run",
+        )
+    return matches
+
+
 def fit_stars(run: Run) -> Run:
     """Fit matched stars by least squares, with errors adjusted to the residuals.
 
@@ -163,7 +195,7 @@ def fit_stars(run: Run) -> Run:
     if stars.in_memory and stars.epoch is not None:
         # only for all stars: a sample may have none in a short segment
         refuse_empty_segments(stars.epoch, model.time)
-    earlier = earlier_calibration(model, config, run.base)
+    earlier = earlier_calibration(model, config, run.base, stars)
     try:
         fitted = _fitted(run, model, config, earlier)
     except (DegenerateError, NotSettledError) as error:
@@ -208,8 +240,17 @@ def read_stars(config: MatchesConfig, base: Path) -> Matches:
 
     The stars keep the file names relative to `base`, so that a run does not depend on its folder.
     """
-    data, size = config.data, config.detector.size
-    stars = read_configured(data.paths(base), data, size=size, chips=config.chip)
+    size, block = config.detector.size, config.prior_calibration
+
+    def read(data: Data) -> Matches:
+        return read_configured(data.paths(base), data, size=size, chips=config.chip)
+
+    if block is None:
+        stars = read(config.data)
+    else:
+        earlier = _calibration(calibration_file(base / block.source), block.filter)
+        frames = block.frame or config.model.frames
+        stars = read_on_plane(earlier, config.data, read, frames=frames)
     return stars.named_below(str(base))
 
 
@@ -301,15 +342,27 @@ def priors_of(model: DistortionModel, config: Config) -> GaussianPriors:
 
 
 def earlier_calibration(
-    model: DistortionModel, config: Config, base: Path
+    model: DistortionModel, config: Config, base: Path, stars: Matches | None = None
 ) -> CalibrationPrior | None:
-    """Prior from the calibration that a configuration names; None if it names none."""
+    """Prior from the calibration that a configuration names; None if it names none.
+
+    Raises InputError if `stars` are on another tangent plane; see `refuse_other_plane`.
+    """
     block = config.prior_calibration
     if block is None:
         return None
-    path = calibration_file(base / block.source)
+    earlier = _calibration(calibration_file(base / block.source), block.filter)
+    if stars is not None:
+        frames = block.frame or model.frames
+        refuse_other_plane(earlier, stars, frames=frames)
+        if frames in ("none", "shift") and earlier.plane.point is None and stars.tangent_point:
+            log.warning(
+                "fit: u and v of the prior %s state no tangent point and are taken to have that of "
+                "the stars, %s",
+                *(earlier.name, list(stars.tangent_point)),
+            )
     return prior_of_calibration(
-        _calibration(path, block.filter),
+        earlier,
         model,
         frame=block.frame,
         epoch=block.epoch,

@@ -2,23 +2,33 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Unpack
 
+import numpy as np
+
 from bayesdist.app.config import ChipBlock
 from bayesdist.app.stars import RunInput
 from bayesdist.app.store.rundir import RunDirectory
+from bayesdist.calibration.calibration import Calibration
+from bayesdist.calibration.plane import ARCSEC
 from bayesdist.data import Matches, input_files, open_matches, read_matches
 from bayesdist.data.reading.options import ReadArguments
+from bayesdist.data.sky import separation, sky_of_plane
 from bayesdist.data.tables.parquet import describe_part
 from bayesdist.errors import InputError
 from bayesdist.kinds.matches.config import Data
 from bayesdist.plugin import mission_objects
 
+log = logging.getLogger("bayesdist")
+
 IN_MEMORY = 1_000_000  # rows of Parquet above which tables stay on disk
+
+SAME_POINT = 1e-6  # arcsec, the distance below which tangent points are the same
 
 PathLike = str | os.PathLike[str]
 
@@ -113,6 +123,100 @@ def read_configured(
     if source is not None and size is not None:
         return source.read(path, data, size)
     return load_matches(path, format=data.format, **reading_options(data, chips))
+
+
+def read_on_plane(
+    earlier: Calibration, data: Data, read: Callable[[Data], Matches], *, frames: str
+) -> Matches:
+    """Read matches that are compared with an earlier calibration, on its tangent plane.
+
+    The default tangent point is the mean direction of the stars, so that other stars of the same
+    field would have another plane.  The point of the calibration is used in its place, except for
+    stars of another field whose exposures have frames.
+
+    Parameters
+    ----------
+    earlier : Calibration
+    data : Data
+        Section that states how to read the matches.
+    read : callable
+        ``read(data)`` returns the matches of a section.
+    frames : str
+        Frames between the matches and the calibration; see `refuse_other_plane`.
+
+    Returns
+    -------
+    Matches
+
+    Raises
+    ------
+    InputError
+        As for `refuse_other_plane`.
+    """
+    matches, point = read(data), earlier.plane.point
+    if point is None or matches.tangent_point in (None, point):
+        return matches
+    if data.tangent_point is None and _in_field(earlier, point, matches.tangent_point):
+        try:
+            matches = read(data.model_copy(update={"tangent_point": point}))
+        except InputError:  # the file itself states u, v and their tangent point
+            log.debug("the tangent point of %s cannot be chosen", ", ".join(matches.sources))
+    refuse_other_plane(earlier, matches, frames=frames)
+    return matches
+
+
+def refuse_other_plane(earlier: Calibration, matches: Matches, *, frames: str) -> None:
+    """Raise InputError if matches and an earlier calibration have different tangent planes.
+
+    Two planes differ by a shift and a rotation, and by terms that are negligible in a small field.
+    `frames` is the kind of frames that are fitted between the matches and the calibration: those
+    with a rotation absorb the difference, and shifts absorb the pointing to another field.
+    """
+    point, other = earlier.plane.point, matches.tangent_point
+    if point is None or other is None or 3600.0 * separation(point, *other) < SAME_POINT:
+        return
+    where = ", ".join(matches.sources)
+    if not _in_field(earlier, point, other):
+        if frames != "none":
+            return
+        raise InputError(
+            f"the stars are {separation(point, *other):.3g} degrees from those of {earlier.name}, "
+            "which are in one frame, so that a pointing cannot be told from a distortion",
+            where=where,
+            do="give stars of the same field, or fit frames of exposures (model.frames)",
+        )
+    if frames in ("none", "shift"):
+        raise InputError(
+            f"the tangent point of the positions is {list(other)}, but that of {earlier.name} is "
+            f"{list(point)}, which moves or rotates all stars without a change of the distortion",
+            where=where,
+            do=f"give RA and Dec, with data.tangent_point = {list(point)} or without it",
+        )
+
+
+def _in_field(
+    earlier: Calibration, point: tuple[float, float], direction: tuple[float, float]
+) -> bool:
+    """True if a direction is at most a diameter of the detector from the centre of its field.
+
+    `point` is the tangent point of the calibration; both are RA and Dec in degrees.
+    """
+    time = earlier.model.time
+    corners = np.concatenate(
+        [
+            earlier.forward(
+                *np.array([[1.0, 1.0, chip.size[0], chip.size[0]], [1.0, chip.size[1]] * 2]),
+                chip=chip.number,
+                epoch=None if time is None else time.epoch0[0],
+            )
+            for chip in earlier.model.chips
+        ]
+    )
+    corners = corners * ARCSEC[earlier.unit]
+    centre = (corners.min(axis=0) + corners.max(axis=0)) / 2.0
+    radius = np.hypot(*(corners - centre).T).max()
+    ra, dec = sky_of_plane(centre[0], centre[1], point)
+    return bool(3600.0 * separation(direction, ra, dec) <= 2.0 * radius)
 
 
 def mission_template(matches: str | Path) -> Template | None:
