@@ -70,7 +70,7 @@ def write_diagnostics(
             *(row["chip"], row["axis"], row["median"], facts["unit"], row["most"]),
         )
     for test in found.score_tests:
-        if test.significant:
+        if test.warned:
             log.info("diagnose: %s: %s", test.finding, test.remedy)
 
 

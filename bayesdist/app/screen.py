@@ -26,6 +26,7 @@ _UNITS_UNKNOWN_TO_ASTROPY = (
 )
 # loggers that print tracebacks of lost connections before our message; Dask sets their levels
 DASK_LOGS = ("distributed.client", "distributed.core", "distributed.comm.tcp", "distributed.utils")
+_OF_STAGE = ": WARNING: "  # between the name of a stage and its warning
 FORMAT = "%(asctime)s %(levelname)-7s %(message)s"
 
 
@@ -79,7 +80,10 @@ class _Plain(logging.Formatter):
 
 
 class _Once(logging.Filter):
-    """Filter that rejects repeated warnings, as of a file that a command reads several times."""
+    """Filter that rejects repeated warnings, as of a file that a command reads several times.
+
+    Stages of a run repeat a warning after their names.
+    """
 
     def __init__(self) -> None:
         super().__init__()
@@ -87,9 +91,9 @@ class _Once(logging.Filter):
 
     def filter(self, record: logging.LogRecord) -> bool:
         """True unless the record is a warning that was passed before."""
-        if record.levelno < logging.WARNING:
+        if record.levelno != logging.WARNING:
             return True
-        text = record.getMessage()
+        text = record.getMessage().rsplit(_OF_STAGE, 1)[-1]
         if text in self._seen:
             return False
         self._seen.add(text)

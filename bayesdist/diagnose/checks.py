@@ -13,7 +13,7 @@ from bayesdist.diagnose.holdout.validation import HoldoutValidation
 from bayesdist.diagnose.residuals.binned import Coverage
 from bayesdist.diagnose.residuals.misfit import Misfit, worst_misfit
 from bayesdist.diagnose.residuals.stars import ExposureScatter
-from bayesdist.diagnose.score.result import ScoreTest
+from bayesdist.diagnose.score.result import DISPLACED_GROUP, ScoreTest
 from bayesdist.infer import LinearFit
 from bayesdist.infer.exposures.frame_choice import frames_that_help
 from bayesdist.infer.posterior.checks import fit_checks, pixel_doubt
@@ -166,7 +166,8 @@ def structure_checks(
     """Checks of the structure that a fit leaves in the residuals.
 
     There is one misfit per chip, or none.  The `correlated` errors of the solution include some of
-    the structure.  Significant score `tests` may indicate its origin.
+    the structure.  Significant score `tests` may indicate its origin.  Structure is not warned of
+    where `score_checks` warns of a displaced group of stars, which may cause it.
     """
     if not misfits:
         return
@@ -190,6 +191,8 @@ def structure_checks(
             sentence += "tests have found some"
         if (held or 0.0) < STRUCTURE_IN_BUDGET.value * entry.structure:
             doubt = LARGER
+        if displaced_group(tests):
+            sentence = doubt = ""
     yield Check(
         FIT,
         "Structure in the residuals, beyond noise",
@@ -224,16 +227,24 @@ def score_checks(
     Verdicts stay valid if the correlated errors include what the tests have found.  Noise is
     included in the sandwich covariance, unless the residuals are lopsided or truncated by the match
     radius: that covariance includes the scatter of a solution, but not its displacement.
+
+    What a displaced group of stars accounts for is named in the check of the group.
     """
     limit = f"p at least {number(SCORE_LIMIT.value, 1)}"
     by_remedy: dict[str, list[ScoreTest]] = {}
     for test in tests:
-        if test.significant:
+        if test.warned:
             by_remedy.setdefault(test.remedy, []).append(test)
+    of_group = [test for test in tests if test.significant and not test.warned]
     displaced = displacing(tests)
     for remedy, several in by_remedy.items():
-        sentence = f"{'; '.join(test.finding for test in several)}: {remedy}"
-        doubts = {test.doubt for test in several if not _held(correlated, test, tests, displaced)}
+        clauses, related = [test.finding for test in several], several
+        if of_group and displaced_group(several):
+            others = ", ".join(test.name for test in of_group)
+            clauses.append(f"what other tests found may come from it ({others})")
+            related = [*several, *of_group]
+        sentence = f"{'; '.join(clauses)}: {remedy}"
+        doubts = {test.doubt for test in related if not _held(correlated, test, tests, displaced)}
         doubt = EITHER if EITHER in doubts else LARGER if doubts else ""
         names = ", ".join(test.name for test in several)
         value = "; ".join(
@@ -244,6 +255,11 @@ def score_checks(
     if tests and not by_remedy:
         name = f"Tests of the residuals ({len(tests)})"
         yield Check(SCORE_TESTS, name, "nothing found", limit, "pass")
+
+
+def displaced_group(tests: Sequence[ScoreTest]) -> bool:
+    """True if tests have found a displaced group of stars that accounts for other findings."""
+    return any(test.name == DISPLACED_GROUP and test.warned and not test.cause for test in tests)
 
 
 def displacing(tests: Sequence[ScoreTest]) -> bool:

@@ -12,6 +12,7 @@ import numpy as np
 from bayesdist.data import MagnitudeErrors, Matches
 from bayesdist.diagnose.checks import (
     coverage_checks,
+    displaced_group,
     exposure_checks,
     holdout_checks,
     input_checks,
@@ -48,7 +49,7 @@ from bayesdist.diagnose.residuals.stars import (
     star_sample,
     star_sums,
 )
-from bayesdist.diagnose.score.result import DISPLACED_GROUP, ScoreTest
+from bayesdist.diagnose.score.result import ScoreTest
 from bayesdist.diagnose.score.tests import score_tests
 from bayesdist.errors import InputError
 from bayesdist.infer import Compute, GaussianPriors, LinearFit, Posterior, Shards, fit_linear
@@ -186,16 +187,16 @@ class Diagnostics:
     def checks_of_input(self) -> tuple[Check, ...]:
         """Checks of the fit and its matching, taking the results of the tests into account."""
         findings = [
-            test.name for test in self.score_tests if test.significant and test.held_by != "noise"
+            test.name for test in self.score_tests if test.warned and test.held_by != "noise"
         ]
-        if any(misfit.significant for misfit in self.misfits):
+        of_group = displaced_group(self.score_tests)
+        if any(misfit.significant for misfit in self.misfits) and not of_group:
             findings.append("structure in the residuals")
         if self.correlated is not None and self.correlated.facts.get("exposures_outlying"):
             findings.append("exposures that deviate far more than the others")
         if self.majority:
             findings.append("more false than true pairs")
-        uncut = replace(self.chi_square, uncut=DISPLACED_GROUP in findings)
-        return uncut.check(findings), *self.input_checks
+        return self.chi_square.check(findings, displaced=of_group), *self.input_checks
 
     @property
     def checks(self) -> tuple[Check, ...]:
@@ -494,6 +495,7 @@ def diagnose_fit(
             explained_by_false_matches(posterior, sigma),
             eliminated is None,
             "" if match_radius is None else _radius_doubt(sample, match_radius),
+            match_radius is not None and not table.has_nominal,
         ),
         input_checks=tuple(checks),
         dates=dates_of(stars if stars.in_memory else table),

@@ -113,7 +113,8 @@ def warn_of_missing_extensions(header: fits.Header, n: int, where: str) -> str:
         return ""
     clause = (
         f"its primary header states {stated} extensions (NEXTEND), and the file has {n}: the "
-        "others are missing, or the file is truncated"
+        "others are missing, or the file is truncated; fetch the whole file, or correct or remove "
+        "NEXTEND"
     )
     log.warning("%s: %s", where, clause)
     return clause

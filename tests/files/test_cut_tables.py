@@ -9,6 +9,7 @@ import pytest
 from astropy.table import Table
 
 import bayesdist as bd
+from bayesdist.app.screen import _Once
 from bayesdist.errors import FormatError
 from bayesdist.files.tables import read_table
 from bayesdist.products.common.content import read_content
@@ -174,7 +175,7 @@ def test_a_fits_file_that_was_cut_between_two_hdus(tmp_path, caplog, stated, say
 
 
 def test_a_command_shows_a_warning_of_a_file_once_and_as_a_warning(tmp_path):
-    """`init` reads a table several times."""
+    """`init` reads a table several times, and `check` also states what it has read."""
     rng = np.random.default_rng(5)
     x, y = rng.uniform(1, 1000, (2, 300))
     u, v = x - 500 + 0.05 * rng.normal(size=300), y - 500 + 0.05 * rng.normal(size=300)
@@ -188,3 +189,48 @@ def test_a_command_shows_a_warning_of_a_file_once_and_as_a_warning(tmp_path):
     lines = [line for line in err.splitlines() if "NEXTEND" in line]
     assert len(lines) == 1
     assert lines[0].startswith("WARNING: ")
+    shown = good("check", tmp_path / "config.toml")
+    lines = [line for line in (shown.out + shown.err).splitlines() if "NEXTEND" in line]
+    assert len(lines) == 1
+    assert lines[0].startswith("WARNING: ") and "fetch the whole file" in lines[0]
+
+
+def test_missing_extensions_leave_a_verdict_as_it_is(tmp_path):
+    """The rows that were read are those of a whole table."""
+    rng = np.random.default_rng(6)
+    x, y = rng.uniform(1, 1000, (2, 400))
+    u, v = np.stack([x, y]) - 500 + 0.02 * rng.normal(size=(2, 400))
+    path = tmp_path / "stars.fits"
+    Table({"x": x, "y": y, "u": u, "v": v}).write(path)
+    raw = path.read_bytes()
+    end = raw.index(b"END" + 77 * b" ")
+    raw = raw[:end] + b"NEXTEND = 3".ljust(80) + raw[end : end + 80] + raw[end + 160 :]
+    path.write_bytes(raw)
+    run = bd.calibrate(
+        read_table(path),
+        order=2,
+        size=(1000, 1000),
+        requirements=bd.Requirement("field", "p95", 0.2),
+        catalogue=bd.Catalogue("exact", sigma=0.0005, unit="pix", source="simulated"),
+        sigma=0.02,
+        settings={"data": {"unit": "pix"}, "sampler": {"target_ess": 400}},
+    )
+    [margin] = run.check()
+    assert margin.verdict == "met"
+    [check] = [check for check in run.checks if "NEXTEND" in check.sentence]
+    assert (check.level, check.doubt) == ("warn", "")
+
+
+def test_only_repeated_warnings_are_left_out():
+    """Stages say a warning again after their names; errors and results are never left out."""
+    passes = _Once().filter
+
+    def said(level: int, text: str) -> bool:
+        return passes(logging.makeLogRecord({"levelno": level, "msg": text}))
+
+    assert said(logging.WARNING, "a file is cut")
+    assert not said(logging.WARNING, "a file is cut")
+    assert not said(logging.WARNING, "evaluate: WARNING: a file is cut")
+    assert said(logging.WARNING, "evaluate: WARNING: another file is cut")
+    for level in (logging.INFO, logging.ERROR):
+        assert said(level, "a file is cut") and said(level, "a file is cut")

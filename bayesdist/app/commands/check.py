@@ -57,8 +57,11 @@ def _lines(run: Run) -> Iterator[str]:
         f"matches      {len(matches)} of {matches.n_rows} rows, "
         f"{len(matches.exposure_names)} exposure(s), u and v in {matches.unit}"
     )
+    checks = run.checks
+    stated = {check.sentence for check in checks}
     for note in matches.notes:
-        yield f"read         {note}"
+        if note not in stated:  # otherwise logged as a warning when its file was read
+            yield f"read         {note}"
     for reason, count in matches.rejected.items():
         yield f"left out     {count} rows: {reason}"
     yield (
@@ -84,12 +87,10 @@ def _lines(run: Run) -> Iterator[str]:
             yield f"geometry     {chip.mirrored}"
     yield _cost(run)
     idle = idle_dates(config, config.requirements())
-    checks = run.checks
-    stated = {check.sentence for check in checks}
     for text in (
         *(text for text in doubts_on_run(run) if text not in stated),
         *(text for chip in chips for text in chip.warnings),
-        *warnings_of(checks),
+        *warnings_of(check for check in checks if check.sentence not in matches.notes),
         *([idle] if idle else []),
     ):
         yield f"WARNING      {text}"

@@ -104,6 +104,7 @@ class ScoreTestRow(SummaryPart):
     remedy: str
     finding: str
     significant: bool
+    cause: str = Field("", description="name or group of the finding that this one may come from")
 
 
 class CoverageRow(SummaryPart):

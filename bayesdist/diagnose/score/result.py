@@ -99,6 +99,9 @@ class ScoreTest:
         Name of the group of related tests; empty if the test belongs to none.
     doubt : str
         Effect of the finding on verdicts, see `Check`.
+    cause : str
+        Name or group of another finding that the finding may come from, and whose remedy it has;
+        empty if there is none.
     """
 
     name: str
@@ -115,6 +118,12 @@ class ScoreTest:
     held_by: HeldBy = ""
     group: str = ""
     doubt: str = LARGER
+    cause: str = ""
+
+    @property
+    def warned(self) -> bool:
+        """True if the result is significant and not accounted for by a displaced group of stars."""
+        return self.significant and self.cause != DISPLACED_GROUP
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,7 +191,7 @@ def corrected(outcomes: Sequence[Outcome]) -> tuple[ScoreTest, ...]:
     causes = _causes(by_name, outcomes)
     out = []
     for result, is_significant in zip(outcomes, significant, strict=True):
-        family, remedy = result.family, result.family.remedy
+        family, remedy, cause = result.family, result.family.remedy, ""
         # a single effect must pass the first step of Holm's procedure
         smallest = result.smallest(SCORE_TESTS.value / len(outcomes))
         finding = f"{family.absent} ({smallest:.2g} {result.unit} rms would have been found)"
@@ -209,6 +218,7 @@ def corrected(outcomes: Sequence[Outcome]) -> tuple[ScoreTest, ...]:
                 family.held_by,
                 family.group,
                 family.doubt,
+                cause,
             )
         )
     return tuple(out)

@@ -61,8 +61,8 @@ class ChiSquare:
         include.
     radius_doubt : str
         Clause on a stated match radius that no match comes near; empty if there is none.
-    uncut : bool
-        True if tests of the residuals have excluded that the match radius has cut them.
+    cut_elsewhere : bool
+        True if matches may have been cut at a radius about positions that are not given.
     """
 
     total: float
@@ -71,14 +71,15 @@ class ChiSquare:
     false_matches: bool = False
     catalogue: bool = True
     radius_doubt: str = ""
-    uncut: bool = False
+    cut_elsewhere: bool = False
 
-    def check(self, findings: Sequence[str] = ()) -> Check:
+    def check(self, findings: Sequence[str] = (), *, displaced: bool = False) -> Check:
         """Check that chi-square is about one per degree of freedom.
 
         `findings` are the names of other findings in the residuals, such as missing terms.  If the
         model does not describe the positions, large residuals are no evidence against the quoted
-        errors.
+        errors.  `displaced` is True if a part of the stars is displaced as a whole: that test has
+        excluded a cut of normal errors about the solution.
         """
         ratio = self.total / self.dof if self.dof > 0 else float("nan")
         small = scatter_too_small(self.total, self.dof)
@@ -92,11 +93,11 @@ class ChiSquare:
             number(ratio),
             f"{CHI2_TOO_SMALL.value:g} to {CHI2_TOO_LARGE.value:g}",
             level_of(not small and CHI2_TOO_LARGE.met_by(ratio), "warn"),
-            self._sentence(small, findings),
+            self._sentence(small, findings, uncut=displaced and not self.cut_elsewhere),
             doubt,
         )
 
-    def _sentence(self, small: bool, findings: Sequence[str]) -> str:
+    def _sentence(self, small: bool, findings: Sequence[str], *, uncut: bool) -> str:
         """Sentence on a chi-square that is not about one; empty where it is."""
         ratio = self.total / max(self.dof, 1)
         if small and self.in_circle:
@@ -106,7 +107,7 @@ class ChiSquare:
                 "posterior accounts for the circle"
             )
         if small:
-            why = "" if self.uncut else "the match radius has cut the residuals, or "
+            why = "" if uncut else "the match radius has cut the residuals, or "
             return (
                 f"chi-square per degree of freedom is {ratio:.2g}: {why}the quoted errors are too "
                 "large, and with them all uncertainties"

@@ -94,9 +94,10 @@ class MatchesKind(RunKind[MatchesConfig, Matches]):
     def fit_notes(self, run: Run) -> Iterator[tuple[int, str]]:
         """Notes and warnings about the stars."""
         matches, fit = run.placed, run.fit
-        warnings = _warnings_of_files(matches)
+        logged = _warnings_of_files(matches)  # when they were read
         for note in matches.notes:
-            yield logging.WARNING if note in warnings else logging.INFO, note
+            if note not in logged:
+                yield logging.INFO, note
         for reason, count in matches.rejected.items():
             yield logging.INFO, f"{count} rows were left out in reading: {reason}"
         for text in doubts_on_run(run):
@@ -117,11 +118,10 @@ class MatchesKind(RunKind[MatchesConfig, Matches]):
     def checks(self, run: Run) -> tuple[Check, ...]:
         """Checks of positions that were probably computed from the pixels, and of cut files."""
         text = doubt_on_positions(run)
-        names = {text: "Origin of the positions"} if text else {}
-        names |= dict.fromkeys(_warnings_of_files(run.placed), "Files of the matches")
-        return tuple(
-            Check("Matching", name, "", "", "warn", text, LARGER) for text, name in names.items()
-        )
+        found = [("Origin of the positions", text, LARGER)] if text else []
+        # missing extensions do not change the errors of the rows that were read
+        found += [("Files of the matches", note, "") for note in _warnings_of_files(run.placed)]
+        return tuple(Check("Matching", name, "", "", "warn", *words) for name, *words in found)
 
     def source(self, directory: RunDirectory) -> RunInput | None:
         """Matches in the format of a mission; None for tables."""

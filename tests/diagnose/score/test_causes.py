@@ -124,6 +124,14 @@ def test_a_large_chi_square_may_be_the_catalogues():
     assert not ChiSquare(1100.0, 1000.0).check().sentence
 
 
+@pytest.mark.parametrize("cut_elsewhere", [False, True])
+def test_a_displaced_group_does_not_exclude_a_cut_about_other_positions(cut_elsewhere):
+    small = ChiSquare(500.0, 1000.0, cut_elsewhere=cut_elsewhere)
+    names_cut = "the match radius has cut" in small.check(displaced=True).sentence
+    assert names_cut == cut_elsewhere
+    assert "the match radius has cut" in small.check().sentence
+
+
 def test_a_radius_that_no_match_comes_near_is_named_beside_a_large_chi_square():
     suspect = ChiSquare(2000.0, 1000.0, radius_doubt="the match radius is 1 pix")
     assert (
