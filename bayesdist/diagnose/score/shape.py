@@ -39,8 +39,8 @@ REMEDY = (
     "exposures or visits without a label, stars whose proper motions are missing, blends, ghosts, "
     "charge-transfer tails, or a match radius that cuts true matches make such residuals: give the "
     "exposure of each star and fit frames, give proper motions with their errors and both dates, "
-    "cut the stars that are displaced, or give u_nominal and v_nominal; a higher order or larger "
-    "errors do not help"
+    "leave out the stars that are displaced, or give u_nominal and v_nominal; a higher order or "
+    "larger errors do not help"
 )
 SKEWNESS = Family(
     "skewness by position",
