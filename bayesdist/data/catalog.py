@@ -392,8 +392,8 @@ _ALIASES: dict[str, tuple[str, ...]] = {
     "v": ("v", "y0", "eta"),
     "ra": ALIASES["ra"],
     "dec": ALIASES["dec"],
-    "sigma_u": ("sigma_u", "su", "u_error", "x0e", *ALIASES["sigma_ra"]),
-    "sigma_v": ("sigma_v", "sv", "v_error", "y0e", *ALIASES["sigma_dec"]),
+    "sigma_u": ("sigma_u", "su", "u_error", "x0e", *ALIASES["sigma_ra"], *ALIASES["sigma_u"]),
+    "sigma_v": ("sigma_v", "sv", "v_error", "y0e", *ALIASES["sigma_dec"], *ALIASES["sigma_v"]),
     "pm_u": ("pm_u", "vx", *ALIASES["pm_ra"]),
     "pm_v": ("pm_v", "vy", *ALIASES["pm_dec"]),
     "sigma_pm_u": ("sigma_pm_u", "vxe", *ALIASES["sigma_pm_ra"]),
@@ -532,6 +532,7 @@ def catalog_from_table(
             where=source,
             do="rename the columns, or name them with the option 'columns'",
         )
+    refuse_half(_PAIRS[0], column_names, where=source, what="errors")
     unread = _unread(column_names, on_sky=on_sky)
     column_names = {key: name for key, name in column_names.items() if key not in unread}
     if on_sky:

@@ -818,6 +818,16 @@ def test_init_names_the_release_of_gaia_if_motions_can_be_applied(tmp_path, epoc
     assert [row.name for row in config.budget] == ([] if name else ["reference catalogue"])
     assert config.states_catalogue == bool(name)
     assert ("No error of the reference catalogue is stated" in out) == (not name)
+    text = (tmp_path / "c.toml").read_text()
+    lines = '# [catalogue]\n# name = "Gaia DR3"\n'
+    assert (lines in text) == (epoch == 2016.0 and not dated)
+    if lines in text:  # with the date they take the place of the row
+        text = text.replace(lines, lines.replace("# ", ""))
+        text = text.replace("# epoch = 2012.5", "epoch = 2012.5")
+        head, tail = text.split("\n[[budget]]")
+        (tmp_path / "c.toml").write_text(head + tail[tail.index("# [[requirement]]") :])
+        good("check", tmp_path / "c.toml")
+        assert load_config(tmp_path / "c.toml")[0].catalogue.name == "Gaia DR3"
 
 
 def gaia_stars(n, ref_epoch, seed=3):

@@ -157,6 +157,27 @@ def test_bad_catalogues_are_named():
         ReferenceCatalog(u=[], v=[])
 
 
+@pytest.mark.parametrize("axes", [("xi", "eta"), ("u", "v")])
+@pytest.mark.parametrize("form", ["{}_error", "{}_err", "sigma_{}", "e_{}"])
+def test_errors_have_the_names_of_those_of_matches(axes, form):
+    """As those of a table of matches; the errors of 2 and 3 mas are in arcsec."""
+    if (axes[0], form) == ("u", "{}_error"):
+        form = "{}_sigma"
+    table = Table({name: [0.0, 5.0] for name in axes})
+    for name, error in zip(axes, (2.0, 3.0), strict=True):
+        table[name].unit = "arcsec"
+        table[form.format(name)] = [error, 2 * error] * apu.mas
+    catalogue = catalog_from_table(table)
+    assert catalogue.sigma_u == pytest.approx([0.002, 0.004])
+    assert catalogue.sigma_v == pytest.approx([0.003, 0.006])
+
+
+def test_errors_on_one_axis_are_refused():
+    table = Table({"xi": [0.0, 5.0], "eta": [0.0, 1.0], "xi_error": [0.1, 0.1]})
+    with pytest.raises(InputError, match="'sigma_v' is given without its partner"):
+        catalog_from_table(table, unit="arcsec")
+
+
 def test_motions_on_the_sky_are_those_of_astropy(rng):
     n = 40
     t = Table({"ra": 271.0 + rng.uniform(-1, 1, n), "dec": -60 + rng.uniform(-1, 1, n)})

@@ -107,6 +107,13 @@ unit = "{unit}"
 # source = "published: ..."     # where the sizes are from; needed where they really are 0
 """
 
+_UNDATED = """\
+# The columns and {column} = {epoch:g} indicate a catalogue whose published systematic errors
+# grow with time: with the date of the exposures (data.epoch) these lines replace [[budget]].
+# [catalogue]
+# name = {name}
+"""
+
 _STATED = """\
 # Systematic errors of the catalogue, which the columns and {column} = {epoch:g} indicate.
 # Correct the name if it is another catalogue.
@@ -284,7 +291,7 @@ def _of_matches(
     n_outside = _number_outside(table, sizes)
     if n_outside:
         detector = _OUTSIDE.format(n=n_outside, total=len(table)) + detector
-    stated = {} if layout is None else _gaia(layout)
+    stated = {} if layout is None else _gaia(layout, table.unit)
     nx, ny = next(iter(sizes.values()))
     centre = _CENTRE.format(cx=(nx + 1) / 2, cy=(ny + 1) / 2)
     return len(table), {
@@ -314,17 +321,21 @@ def _number_outside(matches: Matches, sizes: Mapping[int, tuple[int, int]]) -> i
     return n
 
 
-def _gaia(layout: TableLayout) -> dict[str, object]:
-    """Value 'catalogue' of the template for stars of a release of Gaia at known dates, or empty."""
+def _gaia(layout: TableLayout, unit: str) -> dict[str, object]:
+    """Value 'catalogue' of the template for stars of a release of Gaia, or empty.
+
+    It is a comment and the usual row, in the unit of u and v, if the exposures have no dates.
+    """
     epochs, taken = layout.catalogue_epochs, layout.taken
-    dated = "pm_ra" in taken and ("epoch" in taken or layout.dated)
-    if epochs is None or epochs[0] != epochs[1] or not dated:
+    if epochs is None or epochs[0] != epochs[1] or "pm_ra" not in taken:
         return {}
     name = _GAIA.get(epochs[0])
     if name is None or not _COLUMNS_OF_GAIA & {column.lower() for column in layout.names}:
         return {}
-    column = taken["catalogue_epoch"]
-    return {"catalogue": _STATED.format(name=quoted(name), column=column, epoch=epochs[0])}
+    facts = {"name": quoted(name), "column": taken["catalogue_epoch"], "epoch": epochs[0]}
+    if "epoch" in taken or layout.dated:
+        return {"catalogue": _STATED.format(**facts)}
+    return {"catalogue": _UNDATED.format(**facts) + _UNSTATED.format(unit=unit)}
 
 
 def _read(

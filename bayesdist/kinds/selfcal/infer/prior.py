@@ -184,21 +184,25 @@ class ReferenceStars:
             )
         none = StarPriors.none(problem.n_stars, problem.n_star)
         centre, precision = none.centre.copy(), none.precision.copy()
-        values, carry = self._carried(problem, rows, matched)
+        values, carry, known = self._carried(problem, rows, matched)
         covariances = self.catalog.covariances[matched]
-        n = carry.shape[1]
-        centre[rows, :n] = np.einsum("nij,nj->ni", carry, values)
-        precision[rows, :n, :n] += np.linalg.inv(carry @ covariances @ np.swapaxes(carry, 1, 2))
+        for n in np.unique(known).tolist():
+            at = known == n
+            J, stars = carry[at, :n], rows[at]
+            centre[stars, :n] = np.einsum("nij,nj->ni", J, values[at])
+            precision[stars, :n, :n] += np.linalg.inv(J @ covariances[at] @ np.swapaxes(J, 1, 2))
         return replace(none, centre=centre, precision=precision)
 
-    def _carried(self, problem: Problem, rows: Int, matched: Int) -> tuple[Float, Float]:
+    def _carried(self, problem: Problem, rows: Int, matched: Int) -> tuple[Float, Float, Int]:
         """Parameters of the catalogue, and their derivatives for those of the stars.
 
         The first are u, v, parallax, pm_u and pm_v (n, 5) of the catalogue's stars `matched`.  The
         second (n, k, 5) are the derivatives, with respect to them, of the first k parameters of the
         problem's stars `rows`: of the position, of the motion if it is fitted and the catalogue has
-        motions with errors, and of the parallax likewise.  Stars without a fitted motion or
-        parallax are where they are on average over their detections.
+        motions with errors, and of the parallax likewise.  The third (n,) is the number of these
+        parameters that the catalogue has for each star: its parallax is unknown if its error is 0.
+        Stars without a fitted motion or parallax are where they are on average over their
+        detections.
         """
         catalog, dates = self.catalog, problem.dates
         columns = (catalog.u, catalog.v, catalog.parallax, catalog.pm_u, catalog.pm_v)
@@ -206,12 +210,13 @@ class ReferenceStars:
         for k, column in enumerate(columns):
             if column is not None:
                 values[:, k] = column[matched]
-        n = 2
+        known = np.full(len(matched), 2)
         if problem.n_star >= 4 and catalog.pm_u is not None and catalog.sigma_pm_u is not None:
-            n = 4
+            known[:] = 4
             sigma = catalog.sigma_parallax
             if problem.n_star == 5 and catalog.parallax is not None and sigma is not None:
-                n = 5 if (sigma[matched] > 0).all() else 4
+                known[sigma[matched] > 0] = 5
+        n = int(known.max(initial=2))
         carry = np.zeros((len(matched), n, len(columns)))
         carry[:, :2, :2] = np.eye(2)
         if n >= 4:
@@ -219,7 +224,7 @@ class ReferenceStars:
         if n == 5:
             carry[:, 4, 2] = 1.0
         if dates is None:
-            return values, carry
+            return values, carry, known
         mean = np.add.reduceat(dates, problem.starts[:-1]) / problem.counts
         when = np.full(len(rows), problem.epoch0) if problem.n_star >= 4 else mean[rows]
         if catalog.pm_u is not None and catalog.epoch is not None:
@@ -234,7 +239,7 @@ class ReferenceStars:
             factors = parallax_factors(each, *catalog.tangent_point)[of_detection]
             sums = np.add.reduceat(factors, problem.starts[:-1], axis=0)
             carry[:, :2, 2] = (sums / problem.counts[:, None])[rows]
-        return values, carry
+        return values, carry, known
 
     def _pairs(self, problem: Problem, catalog: ReferenceCatalog, places: Float) -> tuple[Int, Int]:
         """Indices of the identified stars, and of their reference stars."""

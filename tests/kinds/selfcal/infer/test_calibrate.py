@@ -41,7 +41,10 @@ def test_an_iteration_holds_no_detections_of_the_last():
 
 @pytest.mark.parametrize("motion", ["none", "proper_motion", "parallax"])
 def test_reference_stars_are_where_their_detections_see_them(motion):
-    """Positions, motions and parallaxes with their covariances, at the dates of the detections."""
+    """Positions, motions and parallaxes with their covariances, at the dates of the detections.
+
+    Every third star has no error of its parallax, which is then free if it is fitted.
+    """
     epochs, point = np.linspace(2020.0, 2021.3, 6), (150.0, 2.0)
     simulated = field(2, 6, 300, epochs=epochs)
     factors = parallax_factors(epochs, *point)
@@ -49,13 +52,18 @@ def test_reference_stars_are_where_their_detections_see_them(motion):
     n, rng = len(simulated.sky), np.random.default_rng(46)
     root = rng.standard_normal((n, 5, 5))
     C = 1e-4 * (root @ np.swapaxes(root, 1, 2) + 0.1 * np.eye(5))
+    without = np.arange(n) % 3 == 0
+    C[without, 2] = C[without, :, 2] = 0.0
     sigma = np.sqrt(np.einsum("nii->ni", C))
+    size = np.where(sigma > 0, sigma, 1.0)
+    correlations = C / (size[:, :, None] * size[:, None])
+    correlations[without, 2, 2] = 1.0
     names = ("sigma_u", "sigma_v", "sigma_parallax", "sigma_pm_u", "sigma_pm_v")
     p = np.column_stack([simulated.sky, rng.exponential(0.1, n), 0.05 * rng.normal(size=(n, 2))])
     catalog = ReferenceCatalog(
         p[:, 0], p[:, 1], parallax=p[:, 2], pm_u=p[:, 3], pm_v=p[:, 4], epoch=2016.0,
         tangent_point=point, **dict(zip(names, sigma.T, strict=True)),
-        correlations=C / (sigma[:, :, None] * sigma[:, None]),
+        correlations=correlations,
     )  # fmt: skip
     priors = ReferenceStars(catalog, 2.0)(problem, simulated.theta)
     star, exposure = (a[problem.rows] for a in (simulated.detections.star,
@@ -73,9 +81,13 @@ def test_reference_stars_are_where_their_detections_see_them(motion):
         if motion != "parallax":
             A = A[: 2 if motion == "none" else 4]
             A[:2, 2] = east, north
+        elif without[whose]:
+            A = A[:4]
         expected = np.linalg.inv(A @ C[whose] @ A.T)
-        np.testing.assert_allclose(priors.precision[k], expected, rtol=1e-5)
-        np.testing.assert_allclose(priors.centre[k], A @ p[whose], atol=1e-9)
+        m = len(A)
+        np.testing.assert_allclose(priors.precision[k][:m, :m], expected, rtol=1e-5)
+        np.testing.assert_allclose(priors.precision[k][m:], 0.0, atol=1e-11)
+        np.testing.assert_allclose(priors.centre[k][:m], A @ p[whose], atol=1e-9)
         checked += 1
     assert checked > 100
 
