@@ -47,6 +47,7 @@ MIN_STARS = 100
 # by `LEAST_GAIN` there is no result, as for most residuals without a group.
 SEARCH_STARS = 600
 SEARCH_PASSES = 8
+START_PASSES = 5  # over those with which it compares where it may begin
 LEAST_GAIN = 3.0
 LEAST_OF_OWN = 3.0  # gain in log-likelihood for which the group has a matrix S of its own
 GROUP_DOF = 8  # of the chi-square distribution that bounds twice the gain; see above
@@ -123,9 +124,11 @@ def displaced_group(
     order = np.random.default_rng(1).permutation(n)[:MAX_STARS]
     residual, covariance = residual[:, order], covariance[:, order]
     possible = [_Stars.of(residual, errors) for errors in _possible_errors(covariance)]
-    mixtures, largest, noise = zip(*(_searched(stars) for stars in possible), strict=True)
+    # the last errors, between the stated and equal ones, are tried only where these show a group
+    mixtures, largest, noise = zip(*(_searched(stars) for stars in possible[:2]), strict=True)
     if not max(largest) >= max(noise) + LEAST_GAIN:
         return None
+    mixtures = (*mixtures, *(_searched(stars)[0] for stars in possible[2:]))
     further = [] if len(possible) == 1 else _with_jitter(residual, covariance)
     return _tested(list(zip(possible, mixtures, strict=True)), further)
 
@@ -139,8 +142,10 @@ def _by_star(
     """
     residuals, covariances = [np.zeros((2, 0))], [np.zeros((3, 0))]
     for chip in chips:
-        step = -(-chip.n_stars * len(chips) // MAX_STARS)
-        part = chip.at(np.flatnonzero(chip.star % step == 0)) if step > 1 else chip
+        part, most = chip, MAX_STARS // len(chips)
+        if chip.n_stars > most:
+            kept = np.random.default_rng(1).permutation(chip.n_stars) < most
+            part = chip.at(np.flatnonzero(kept[chip.star]))
         rows = part.rows
         turn = rotations(sample.turn[rows])
         along = np.einsum("nji,jn->in", turn, sample.residual[:, rows])
@@ -279,7 +284,7 @@ def _searched(stars: _Stars) -> tuple[_Mixture, float, float]:
         np.repeat(single.wide_centre, B, axis=0),
         np.repeat(single.wide, B),
     )
-    fits = _fitted(stars, start, one, SEARCH_PASSES)
+    fits = _fitted(stars, start, one, START_PASSES)
     density = _log_density(stars, fits, one).sum(axis=1)
     best = fits.best(int(np.argmax(np.nan_to_num(density, nan=-np.inf))))
     fit = _fitted(every, best, one, SEARCH_PASSES)

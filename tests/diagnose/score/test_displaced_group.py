@@ -9,6 +9,7 @@ from scipy import stats
 
 import bayesdist as bd
 from bayesdist.data.matches import Matches
+from bayesdist.diagnose.score.groups import MAX_STARS
 from tests import seeds
 
 from .shaped import (
@@ -111,6 +112,14 @@ def test_a_run_states_share_and_displacement_and_does_not_decide(name, full):
         advice = check.sentence.rsplit(": ", 1)[1]
         assert "proper motions" in advice and "exposure of each star" in advice
         assert check.doubt and check.sentence.startswith("a part of the stars is displaced")
+        # what the group accounts for is named, and has no warning of its own
+        warned = [one for one in warnings if one.level == "warn" and one.group == "Score tests"]
+        assert warned == [check]
+        texts = " ".join(one.sentence for one in warnings)
+        for words in ("are lopsided", "have two cores", "too abruptly", "in a patch"):
+            assert words not in texts
+        others = [one for one in run.diagnostics.score_tests if one.cause == NAME]
+        assert all(one.name in check.sentence for one in others)
         for other in (*run.diagnostics.checks_of_input, *warnings):
             for word in ("raise model.order", "wider radius", "match radius has cut"):
                 assert word not in other.sentence
@@ -224,6 +233,19 @@ def test_noise_about_one_centre_has_no_displaced_group(full):
         for level in (0.1, 0.01, 1e-3):
             beyond = int((p <= level).sum())
             assert stats.binom.sf(beyond - 1, len(p), level) > 1e-4
+
+
+def test_stars_in_a_periodic_order_are_thinned_at_random():
+    """Of twice as many stars as are examined, every second one is displaced."""
+    rng = np.random.default_rng(76)
+    n = 2 * MAX_STARS
+    x, y = rng.uniform(0.5, SIDE + 0.5, (2, n))
+    uv = true_map(x, y) + SIGMA * gaussian(rng, n)
+    uv[::2] += [4 * SIGMA, 0.0]
+    test = examined(matches_of(x, y, uv))[NAME]
+    assert test.significant
+    group = described(test)
+    assert abs(group.share - 0.5) < 4 * group.share_sigma < 0.1
 
 
 def test_a_run_of_normal_stars_is_decided():
