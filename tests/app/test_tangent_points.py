@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -203,3 +204,22 @@ def test_stars_on_another_plane_than_the_prior_are_refused(release) -> None:
             sigma="columns",
             settings={"prior_calibration": {"source": str(release)}},
         )
+
+
+def test_compare_says_that_tangent_points_differ(release, tmp_path) -> None:
+    """The shift that is taken out is that between the tangent points, for pixels along the axes."""
+    config = write_job(tmp_path / "input", stars(2), **detector())
+    good("run", config, "-o", tmp_path / "run")
+    points = [SkyCoord(*point_of(run), unit="deg") for run in (release, tmp_path / "run")]
+    apart = points[0].separation(points[1]).arcsec
+    said = good("compare", release, tmp_path / "run").out
+    assert said.startswith("No significant difference")
+    assert f"the tangent points of A and B are {apart:.4g} arcsec apart" in said
+    shift = [float(x) for x in re.findall(r"shift in [xy]\s+([-+.\d]+)", said)]
+    # the planes are also rotated, so that the shift depends on its point between both
+    turn = np.radians(points[1].ra.deg - points[0].ra.deg) * np.sin(points[0].dec.rad)
+    bound = abs(turn) * apart + 0.01 * SCALE
+    assert np.hypot(*shift) * SCALE == pytest.approx(apart, abs=bound)
+    rotation = float(re.findall(r"rotation\s+([-+.\d]+)", said)[0])
+    assert abs(rotation) == pytest.approx(abs(np.degrees(turn)), abs=0.002)
+    assert "tangent points" not in good("compare", release, release).out

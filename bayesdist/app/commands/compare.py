@@ -69,6 +69,7 @@ class SkyDifference:
 
 
 IDENTICAL_SKY = 1e-6  # pixels
+SAME_POINT = 1e-6  # arcsec, the distance below which tangent points are the same
 SAME_SHAPE = (
     "The calibrations agree to rounding after shift, rotation and scale, and not on the sky."
 )
@@ -217,7 +218,23 @@ def compare_files(
         Path(item).resolve() if run is None else run.path.resolve()
         for item, run in zip((a, b), runs, strict=True)
     ]
-    return _text(comparisons, gaps, scales[0] or scales[1], sky, related=homes[0] == homes[1])
+    related = homes[0] == homes[1]
+    text = _text(comparisons, gaps, scales[0] or scales[1], sky, related=related)
+    return "\n".join([text, *_planes(laid)])
+
+
+def _planes(both: tuple[Calibration, Calibration]) -> list[str]:
+    """Line on the tangent points of two calibrations, if they differ."""
+    a, b = (calibration.plane.point for calibration in both)
+    if a is None or b is None:
+        return []
+    apart = 3600.0 * float(separation(a, *b))
+    if apart < SAME_POINT:
+        return []
+    return [
+        f"the tangent points of A and B are {apart:.4g} arcsec apart: u and v of the same position "
+        "differ by a shift and a rotation, which are no difference of the distortions"
+    ]
 
 
 def _sky_difference(
