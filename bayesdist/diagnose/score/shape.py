@@ -89,7 +89,8 @@ GROUP_OF_STARS = replace(
 )
 
 CUT_ELSEWHERE = (
-    "; if matches were cut at a radius about other positions, give these as u_nominal and v_nominal"
+    "; if a match radius has cut true matches about other positions, give these as u_nominal and "
+    "v_nominal"
 )
 
 # (6,) powers of the Legendre polynomials with which the shape may vary: 1, X, Y, XY, X^2, Y^2
