@@ -186,6 +186,9 @@ def structure_checks(
         sentence = f"{entry.finding}, and the budget holds {included} of it"
         if correlated is None:
             sentence = entry.sentence
+            if not tests:
+                sentence += "; stars that are displaced as a whole, for which a run tests, may "
+                sentence += "also cause it"
         if displacing(tests):
             sentence += "; it may come from residuals that are lopsided or cut, of which score "
             sentence += "tests have found some"

@@ -244,6 +244,22 @@ def test_what_displaced_stars_do_has_their_remedy():
     misfit = Misfit(1e-9, "cells", 0.01, "pix")
     [structure] = structure_checks([misfit], None, list(found.values()))
     assert "it may come from residuals that are lopsided" in structure.sentence
+    [untested] = structure_checks([misfit])
+    assert "displaced as a whole" in untested.sentence
+
+
+def test_structure_is_not_warned_of_beside_a_displaced_group():
+    """It stays in the table, and the group doubts the verdict."""
+    rng = np.random.default_rng(3)
+    x, y = rng.uniform(0.5, SIDE + 0.5, (2, 2000))
+    uv = true_map(x, y) + SIGMA * gaussian(rng, 2000)
+    uv[rng.uniform(size=2000) < 0.35] += [4 * SIGMA, 0.0]
+    found = list(examined(matches_of(x, y, uv)).values())
+    [check] = score_checks(found)
+    assert check.doubt and check.sentence.startswith("a part of the stars is displaced")
+    [structure] = structure_checks([Misfit(1e-9, "cells", 0.01, "pix")], None, found)
+    assert (structure.level, structure.sentence, structure.doubt) == ("warn", "", "")
+    assert "0.01" in structure.value
 
 
 def test_noise_is_held_only_where_the_residuals_are_symmetric():
