@@ -293,6 +293,19 @@ def test_a_damaged_fit_is_named(written, campaign, tmp_path, damage):
         load_fit(path)
 
 
+def test_a_fit_without_a_number_that_is_needed_has_to_be_made_again(campaign, tmp_path):
+    """As a file that was written before the limit of spared pairs was stored."""
+    *_, fit = campaign
+    path = tmp_path / "fit.nc"
+    save_fit(fit, path)
+    with h5py.File(path, "a") as file:
+        del file.attrs["clip_spared_chi2"]
+    with pytest.raises(
+        FormatError, match=r"fit\.nc: .*make it again with 'bayesdist stage fit RUN'"
+    ):
+        load_fit(path)
+
+
 @pytest.mark.parametrize("kind", ["fit", "posterior"])
 def test_damage_that_hdf5_reports_in_its_own_way(tmp_path, monkeypatch, kind):
     """h5py raises RuntimeError where the dimension scales are damaged."""
