@@ -280,9 +280,16 @@ def _causes(significant: Mapping[str, Family], outcomes: Sequence[Outcome]) -> d
     }
     weaker |= set(STEEP) - {max(steep, key=steep.__getitem__, default="")}
     # Structure of the size of the errors correlates the residuals and gives them two cores, as
-    # displaced stars do, but they are not lopsided.
+    # displaced stars do, but they are not lopsided. Half of the stars make them lopsided neither,
+    # and are seen best in the distribution of the residuals, structure in their positions.
     if steep and not set(SKEWED) & set(significant):
-        weaker |= {name for name, family in significant.items() if family.group == "shape"}
+        most = max(steep.values())
+        weaker |= {
+            name
+            for name, family in significant.items()
+            if family.group == "shape"
+            and not (family.name == DISPLACED_GROUP and by_name[DISPLACED_GROUP][0] > most)
+        }
     return {name: family for name, family in significant.items() if name not in weaker}
 
 

@@ -197,6 +197,20 @@ def test_rings_of_the_size_of_the_errors_are_no_displaced_stars(size):
     assert len(remedies) == 1 and "without a label" not in remedies.pop()
 
 
+@pytest.mark.parametrize("size", [1.5, 3.0])
+def test_a_sine_of_the_size_of_the_errors_is_no_displaced_group(size):
+    """It has two centres, like half of the stars if displaced, but follows the position."""
+
+    def sine(rng, x, y):
+        wave = np.sin(2 * np.pi * x / rng.uniform(60, 300) + rng.uniform(0, 6))
+        return size * SIGMA * np.sqrt(2) * wave[:, None] * np.array([1.0, 0.3])
+
+    found = examined(scene(np.random.default_rng(15), 3000, sine))
+    assert found["displaced group of stars"].significant
+    remedies = {test.remedy for test in found.values() if test.significant}
+    assert remedies == {found["repeating pattern"].remedy}
+
+
 def test_a_star_counts_once():
     """Rows that stand three times with the code of their star say no more than once."""
     rng = np.random.default_rng(8)
