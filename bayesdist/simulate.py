@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from bayesdist.data.batches import even_edges
 from bayesdist.data.matches import Matches
-from bayesdist.data.storage import write_partitioned
+from bayesdist.data.writing import write_partitioned
 from bayesdist.errors import InputError
 from bayesdist.model import DistortionModel
 from bayesdist.utils.arrays import Bool, Float, Int

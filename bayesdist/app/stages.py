@@ -28,7 +28,7 @@ from bayesdist.app.store.record import attributes, write_table
 from bayesdist.app.store.rundir import RunDirectory, part_files
 from bayesdist.app.store.summary import GeometryRow, SamplerSection
 from bayesdist.data import Matches
-from bayesdist.data.storage import write_columns
+from bayesdist.data.writing import write_columns
 from bayesdist.errors import InputError, NotConvergedError
 from bayesdist.files.atomic import made_folder, remove_leftovers
 from bayesdist.infer import LinearFit, Posterior, save_posterior

@@ -57,8 +57,6 @@ from .starlists import (
     StarCuts as StarCuts,
     read_star_lists as read_star_lists,
 )
-from .storage import (
-    open_matches as open_matches,
-    write_partitioned as write_partitioned,
-)
+from .storage import open_matches as open_matches
 from .tables.column import UNITS as UNITS
+from .writing import write_partitioned as write_partitioned

@@ -8,7 +8,7 @@ from astropy.table import Table
 
 from bayesdist.data import Matches, open_matches, read_matches
 from bayesdist.data.preparing import HoldoutSpec, split_matches
-from bayesdist.data.storage import write_partitioned
+from bayesdist.data.writing import write_partitioned
 from bayesdist.errors import InputError
 
 NOMINAL = ("u_nominal", "v_nominal")

@@ -22,7 +22,7 @@ from bayesdist.app.stars import ErrorLaw
 from bayesdist.app.store.record import write_table
 from bayesdist.data import ReferenceCatalog
 from bayesdist.data.matches import Matches
-from bayesdist.data.storage import write_columns
+from bayesdist.data.writing import write_columns
 from bayesdist.diagnose.correlated import Discrepancy, DiscrepancyPriors
 from bayesdist.diagnose.residuals.misfit import Misfit
 from bayesdist.diagnose.score.result import ScoreTest

@@ -12,8 +12,8 @@ from astropy.table import Table
 from bayesdist.data import ReferenceCatalog, read_catalog
 from bayesdist.data.exposures import ExposureLog, read_exposures, write_exposures
 from bayesdist.data.starlists import read_star_lists
-from bayesdist.data.storage import write_columns
 from bayesdist.data.tables.checks import columns_of
+from bayesdist.data.writing import write_columns
 from bayesdist.errors import InputError
 from bayesdist.files.atomic import atomic_path, made_folder
 from bayesdist.files.faults import naming_faults

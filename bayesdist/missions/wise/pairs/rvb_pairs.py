@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.data.matches import Matches
-from bayesdist.data.storage import Labelled, Part, write_parts
 from bayesdist.data.tables.checks import columns_of
+from bayesdist.data.writing import Labelled, Part, write_parts
 from bayesdist.errors import InputError
 from bayesdist.files.atomic import made_folder
 from bayesdist.utils.arrays import Bool, Float, Int

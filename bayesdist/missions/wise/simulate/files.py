@@ -13,7 +13,7 @@ import numpy as np
 from astropy.table import Table
 from numpy.typing import NDArray
 
-from bayesdist.data.storage import Labelled, write_columns
+from bayesdist.data.writing import Labelled, write_columns
 from bayesdist.errors import InputError
 from bayesdist.files.atomic import atomic_path, made_folder
 from bayesdist.missions.wise.simulate.sets import PairChunk, PartitionPattern, WiseSet
