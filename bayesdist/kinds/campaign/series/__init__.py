@@ -20,7 +20,8 @@ from bayesdist.kinds.campaign.series.posterior import (
     fit_series,
     held_out,
 )
-from bayesdist.kinds.campaign.series.series import KINDS, Design, Series, TrendModel
+from bayesdist.kinds.campaign.series.series import Series
+from bayesdist.kinds.campaign.series.trend import KINDS, Design, TrendModel
 
 __all__ = [
     "KINDS",

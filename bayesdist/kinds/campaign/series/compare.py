@@ -30,13 +30,10 @@ from bayesdist.kinds.campaign.series.posterior import (
     fit_series,
     held_out,
 )
-from bayesdist.kinds.campaign.series.sampler import (
-    WIDE,
-    BreakMoves,
-    SeriesProblem,
-    normal_equations,
-)
-from bayesdist.kinds.campaign.series.series import KINDS, Design, Series, TrendModel
+from bayesdist.kinds.campaign.series.problem import WIDE, SeriesProblem, normal_equations
+from bayesdist.kinds.campaign.series.sampler import BreakMoves
+from bayesdist.kinds.campaign.series.series import Series
+from bayesdist.kinds.campaign.series.trend import KINDS, Design, TrendModel
 from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.distributions import t_ppf
 

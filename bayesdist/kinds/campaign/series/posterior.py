@@ -19,8 +19,10 @@ from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.convergence import Convergence, Limits, smoothed_weights
 from bayesdist.infer.equations.scaled import chi_square, one_thread
 from bayesdist.infer.kernel import densities
-from bayesdist.kinds.campaign.series.sampler import Draws, Engine, SeriesProblem, State, run
-from bayesdist.kinds.campaign.series.series import Design, Series, TrendModel
+from bayesdist.kinds.campaign.series.problem import SeriesProblem, State
+from bayesdist.kinds.campaign.series.sampler import Draws, Engine, run
+from bayesdist.kinds.campaign.series.series import Series
+from bayesdist.kinds.campaign.series.trend import Design, TrendModel
 from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.checks import PARETO_K
 

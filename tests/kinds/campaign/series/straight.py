@@ -10,7 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.kinds.campaign.series.series import Design, Series, TrendModel
+from bayesdist.kinds.campaign.series.series import Series
+from bayesdist.kinds.campaign.series.trend import Design, TrendModel
 
 __all__ = ["StraightLines", "straight_lines"]
 

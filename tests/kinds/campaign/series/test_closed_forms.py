@@ -15,7 +15,7 @@ from bayesdist.kinds.campaign.series import (
     fit_series,
     held_out,
 )
-from bayesdist.kinds.campaign.series.sampler import WIDE, SeriesProblem, trend_equations
+from bayesdist.kinds.campaign.series.problem import WIDE, SeriesProblem, trend_equations
 from tests.reduced import case_in_full
 
 from .straight import straight_lines

@@ -11,13 +11,12 @@ from scipy.stats import chisquare
 
 from bayesdist.infer.convergence import Limits
 from bayesdist.kinds.campaign.series import Design, Series, TrendModel
+from bayesdist.kinds.campaign.series.problem import WIDE, SeriesProblem
 from bayesdist.kinds.campaign.series.sampler import (
     FRACTION_PRIOR,
     KAPPA_RATE,
     MAX_FRACTION,
     MIN_KAPPA,
-    WIDE,
-    SeriesProblem,
     run,
 )
 from tests.infer.calibration import over_seeds

@@ -7,7 +7,7 @@ import pytest
 
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.kinds.campaign.series import KINDS, Design, Series, TrendModel
-from bayesdist.kinds.campaign.series.series import Drift
+from bayesdist.kinds.campaign.series.trend import Drift
 
 BREAKS = (2005.3, 2011.0)
 
