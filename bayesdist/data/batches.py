@@ -9,11 +9,6 @@ from bayesdist.errors import InputError
 BATCH = 2**20  # largest number of rows in a batch, the default size of a Parquet row group
 
 
-def batch_edges(n: int) -> list[int]:
-    """Edges 0, ..., n of batches of nearly equal size."""
-    return even_edges(n, BATCH)
-
-
 def even_edges(n: int, most: int) -> list[int]:
     """Edges 0, ..., n of ranges of nearly equal size with at most `most` rows each."""
     return np.linspace(0, n, -(-n // most) + 1).astype(int).tolist()

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Protocol, Unpack
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bayesdist.data.batches import batch_edges, every_kth
+from bayesdist.data.batches import BATCH, even_edges, every_kth
 from bayesdist.data.columns import (
     COLUMNS,
     POSITIONS,
@@ -496,13 +496,18 @@ class Matches(MatchColumns):
             return self.exposure_names
         return tuple(self.exposure_names[k] for k in np.unique(self.exposure))
 
-    def readers(self) -> tuple[BatchReader, ...]:
+    def readers(self, batch_rows: int = BATCH) -> tuple[BatchReader, ...]:
         """Readers of consecutive batches; those on disk are not read yet.
+
+        Parameters
+        ----------
+        batch_rows : int
+            Largest number of rows in a batch. For matches on disk it is that of `open_matches`.
 
         Returns
         -------
         tuple of BatchReader
-            Readers of at most `BATCH` rows each, which can be sent to other processes.
+            Readers of the batches, which can be sent to other processes.
         """
         if self._readers is not None:
             return self._readers
@@ -512,7 +517,7 @@ class Matches(MatchColumns):
                 n_rows=b - a,
                 rejected={},
             )
-            for a, b in pairwise(batch_edges(len(self)))
+            for a, b in pairwise(even_edges(len(self), batch_rows))
         )
 
     def batches(self) -> Iterator[Matches]:
@@ -521,7 +526,7 @@ class Matches(MatchColumns):
         Yields
         ------
         Matches
-            Batch of at most `BATCH` rows, with codes that refer to the names of the whole table.
+            Batch with codes that refer to the names of the whole table.
 
         Raises
         ------

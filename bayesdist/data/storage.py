@@ -18,7 +18,7 @@ import numpy as np
 from astropy.table import Column
 from numpy.typing import NDArray
 
-from bayesdist.data import batches
+from bayesdist.data.batches import BATCH, even_edges
 from bayesdist.data.columns import (
     COLUMNS,
     CORRELATION,
@@ -119,13 +119,20 @@ class StoredRows:
                 yield out
 
 
-def open_matches(path: PathLike | Sequence[PathLike], **options: Unpack[ReadArguments]) -> Matches:
+def open_matches(
+    path: PathLike | Sequence[PathLike],
+    *,
+    batch_rows: int = BATCH,
+    **options: Unpack[ReadArguments],
+) -> Matches:
     """Open matched star positions without reading them into memory.
 
     Parameters
     ----------
     path : path-like or sequence of path-like
         Parquet: a file, a list of files, a pattern, or a folder of parts of one table.
+    batch_rows : int
+        Largest number of rows in a batch, one of which is in memory at a time.
     **options
         Fields of `ReadOptions` by name; rows with missing values or values that are not finite are
         an error.
@@ -192,20 +199,21 @@ def open_matches(path: PathLike | Sequence[PathLike], **options: Unpack[ReadArgu
     if all(part.moves for part in stored):
         stored = _with_motion_prior(stored, reading.motion_prior)
     labels = scan(stored)
-    matches = Matches.from_readers(_readers(labels, stored), labels, _columns_of(stored[0]))
+    readers = _readers(labels, stored, batch_rows)
+    matches = Matches.from_readers(readers, labels, _columns_of(stored[0]))
     return matches if isinstance(sigma, str) else matches.with_errors(sigma)
 
 
-def _readers(labels: Labels, files: Sequence[StoredFile]) -> list[StoredRows]:
+def _readers(labels: Labels, files: Sequence[StoredFile], batch_rows: int) -> list[StoredRows]:
     """Consecutive rows of all files.
 
-    Row groups and files are combined up to `BATCH` rows; larger ones are split evenly.
+    Row groups and files are combined up to `batch_rows`; larger row groups are split evenly.
     """
     out: list[list[Segment]] = [[]]
     size = 0
     for code, file in enumerate(files):
-        for start, stop in _spans(file.part.group_rows):
-            if size + stop - start > batches.BATCH:
+        for start, stop in _spans(file.part.group_rows, batch_rows):
+            if size + stop - start > batch_rows:
                 out.append([])
                 size = 0
             size += stop - start
@@ -220,12 +228,12 @@ def _readers(labels: Labels, files: Sequence[StoredFile]) -> list[StoredRows]:
     ]
 
 
-def _spans(group_rows: Sequence[int]) -> list[tuple[int, int]]:
+def _spans(group_rows: Sequence[int], batch_rows: int) -> list[tuple[int, int]]:
     """First row and row after the last of each row group; large groups are split evenly."""
     out = []
     first = 0
     for rows in group_rows:
-        edges = [first + edge for edge in batches.batch_edges(rows)]
+        edges = [first + edge for edge in even_edges(rows, batch_rows)]
         out += list(pairwise(edges))
         first += rows
     return out

@@ -8,7 +8,6 @@ from astropy.table import Table
 from pyarrow.parquet import read_metadata
 from scipy.stats import binom
 
-from bayesdist.kinds.matches import sources as app_matches
 from bayesdist.simulate import simulate_matches
 from tests.app.support import (
     SIGMA,
@@ -94,14 +93,16 @@ def test_a_resumed_run_sets_the_same_stars_aside(run, tmp_path):
 
 @pytest.mark.slow
 @only_in_full("test_at_scale has a run on disk")
-def test_data_on_disk_give_the_same_answer(run, tmp_path, monkeypatch):
+def test_data_on_disk_give_the_same_answer(run, tmp_path):
     config, whole = run
     folder = tmp_path / "input"
     folder.mkdir()
     Table.read(config.parent / "stars.ecsv").write(folder / "stars.parquet")
-    text = config.read_text(encoding="utf-8").replace("stars.ecsv", "stars.parquet")
+    text = config.read_text(encoding="utf-8").replace(
+        'matches = "stars.ecsv"', 'matches = "stars.parquet"\nrows_in_memory = 1000'
+    )
+    assert "rows_in_memory" in text
     (folder / "config.toml").write_text(text, encoding="utf-8")
-    monkeypatch.setattr(app_matches, "IN_MEMORY", 1000)
     there = partly_run(tmp_path / "run", folder / "config.toml", "fit", "sample", "assess")
     mine, theirs = (Table.read(path / "holdout.ecsv") for path in (whole, there))
     assert list(mine["where"]) == list(theirs["where"])

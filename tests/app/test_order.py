@@ -7,7 +7,6 @@ import pytest
 from astropy.table import Table
 
 from bayesdist.data import write_partitioned
-from bayesdist.kinds.matches import sources as app_matches
 from bayesdist.simulate import simulate_matches
 from tests.app.support import (
     SIGMA,
@@ -99,12 +98,12 @@ def test_the_configured_order_does_not_matter(job, tmp_path):
         np.testing.assert_array_equal(table[name], again[name])
 
 
-def test_files_on_disk_give_the_same(job, tmp_path, monkeypatch):
+def test_files_on_disk_give_the_same(job, tmp_path):
     matches, folder, _, _ = job
-    monkeypatch.setattr(app_matches, "IN_MEMORY", 1000)
     parts = [matches.select(np.arange(a, b)) for a, b in ((0, 7000), (7000, 20_000))]
     write_partitioned(parts, tmp_path / "stars")
-    config = write_config(tmp_path / "config.toml", data={"matches": "stars"})
+    data = {"matches": "stars", "rows_in_memory": 7000}
+    config = write_config(tmp_path / "config.toml", data=data)
     good("select-order", config, "--orders", 1, 4, "-o", tmp_path / "o.ecsv")
     table, again = Table.read(folder / "o.ecsv"), Table.read(tmp_path / "o.ecsv")
     for name in ("rms_u", "rms_v", "F", "stars", "regions"):

@@ -15,7 +15,6 @@ from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data import Matches, write_partitioned
 from bayesdist.diagnose.periods import PeriodSettings, time_variation
 from bayesdist.infer import fit_linear
-from bayesdist.kinds.matches import sources as app_matches
 from bayesdist.model import Chip, DistortionModel
 from tests.app.support import (
     SIZE,
@@ -259,15 +258,12 @@ def test_a_pattern_that_no_polynomial_follows_is_found(tmp_path):
 
 @pytest.mark.slow
 @only_in_full("test_at_scale has a run on disk")
-def test_pairs_on_disk_give_the_same(quiet, tmp_path, monkeypatch):
+def test_pairs_on_disk_give_the_same(quiet, tmp_path):
     run, matches, _ = quiet
-    monkeypatch.setattr(app_matches, "IN_MEMORY", 1000)
-    monkeypatch.setattr("bayesdist.data.batches.BATCH", 1700)
     write_partitioned([matches], tmp_path / "stars")
     sections = {"detector": {"name": "A", "size": SIZE, "scale_mas": 50.0}, "periods": PERIODS}
-    config = write_config(
-        tmp_path / "c.toml", data={"matches": str(tmp_path / "stars")}, **sections
-    )
+    data = {"matches": str(tmp_path / "stars"), "rows_in_memory": 1700}
+    config = write_config(tmp_path / "c.toml", data=data, **sections)
     there = partly_run(tmp_path / "run", config, "fit", "sample", "assess")
     one, other = Table.read(run / "periods.ecsv"), Table.read(there / "periods.ecsv")
     for name in ("difference", "sigma", "monomial_difference"):

@@ -13,7 +13,6 @@ from astropy.table import Table, vstack
 from bayesdist.app.store import Record
 from bayesdist.data import open_matches
 from bayesdist.infer import load_fit
-from bayesdist.kinds.matches import sources
 from bayesdist.missions.wise.pairs.read import read_rvb
 from bayesdist.missions.wise.rvb import RvbTransform
 from tests.app.rvb_jobs import DETECTORS, rvb_job, rvb_pairs, write_rvb_table
@@ -22,12 +21,6 @@ from tests.reduced import only_in_full
 
 RVB = {"colour": (-0.4, 0.9), "accept_centre": 1.0, "accept_corner": 2.5}
 STAGES = ("fit", "sample", "assess", "export")
-
-
-@pytest.fixture
-def on_disk(monkeypatch):
-    """Parquet of more than 100 rows is left on disk."""
-    monkeypatch.setattr(sources, "IN_MEMORY", 100)
 
 
 def counted(table: Table) -> dict[str, int]:
@@ -60,11 +53,11 @@ def test_a_run_of_one_band_out_of_two(tmp_path):
     assert "done before" in good("run", config, "-o", tmp_path / "run", "--resume").err
 
 
-@pytest.mark.usefixtures("no_report", "on_disk")
+@pytest.mark.usefixtures("no_report")
 def test_on_disk_the_pairs_are_selected_once(tmp_path, monkeypatch):
     table = vstack([rvb_pairs(), rvb_pairs(300, "W1", seed=2)])
-    options = {"data": {"band": "W4", "rvb": RVB}}
-    config = rvb_job(tmp_path / "job", table, ".parquet", **options)
+    data = {"band": "W4", "rvb": RVB}
+    config = rvb_job(tmp_path / "job", table, ".parquet", data=data | {"rows_in_memory": 100})
     before = snapshot(tmp_path)
     good("check", config)
     assert snapshot(tmp_path) == before
@@ -82,7 +75,7 @@ def test_on_disk_the_pairs_are_selected_once(tmp_path, monkeypatch):
         for stage in STAGES:
             good("stage", stage, run)
     assert summary_of(run)["data"] == summary["data"]
-    memory = partly_run(tmp_path / "memory", rvb_job(tmp_path / "other", table, **options), "fit")
+    memory = partly_run(tmp_path / "memory", rvb_job(tmp_path / "other", table, data=data), "fit")
     fits = [load_fit(path / "fit.nc") for path in (run, memory)]
     np.testing.assert_allclose(fits[0].mean, fits[1].mean, rtol=0, atol=1e-9)
     good("run", config, "-o", run, "--force")
@@ -91,10 +84,11 @@ def test_on_disk_the_pairs_are_selected_once(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 @only_in_full("tests/kills kills runs")
-@pytest.mark.usefixtures("no_report", "on_disk")
+@pytest.mark.usefixtures("no_report")
 def test_half_a_set_that_a_killed_run_left_is_not_trusted(tmp_path):
     table = rvb_pairs()
-    config = rvb_job(tmp_path / "job", table, ".parquet", data={"rvb": RVB})
+    data = {"rvb": RVB, "rows_in_memory": 100}
+    config = rvb_job(tmp_path / "job", table, ".parquet", data=data)
     good("run", config, "-o", tmp_path / "run")
     run = tmp_path / "run"
     whole = len(open_matches(run / "pairs"))
@@ -113,12 +107,12 @@ def test_half_a_set_that_a_killed_run_left_is_not_trusted(tmp_path):
     assert not list(tmp_path.glob(".bayesdist-*"))
 
 
-@pytest.mark.usefixtures("no_report", "on_disk")
+@pytest.mark.usefixtures("no_report")
 def test_a_set_without_selection_is_used_where_it_is(tmp_path):
     table = rvb_pairs()
     table["epoch"] = 2010.0 + (table["mjd"] - 55197.0) / 365.25
     table.remove_column("mjd")
-    config = rvb_job(tmp_path / "job", table, ".parquet")
+    config = rvb_job(tmp_path / "job", table, ".parquet", data={"rows_in_memory": 100})
     good("run", config, "-o", tmp_path / "run")
     assert not (tmp_path / "run" / "pairs").exists()
     assert summary_of(tmp_path / "run")["data"]["sources"] == [

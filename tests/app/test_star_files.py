@@ -14,10 +14,11 @@ from scipy.stats import norm
 
 from bayesdist.app.stages import write_star_files
 from bayesdist.app.store.rundir import RunDirectory, part_files
-from bayesdist.data import batches, read_matches
+from bayesdist.data import read_matches
 from bayesdist.files.parquet import parquet_units
 from bayesdist.infer import load_fit, load_posterior
 from tests.app.support import begin_stagewise, good, snapshot, summary_of, write_job
+from tests.batched import in_batches
 
 
 @pytest.fixture(scope="module")
@@ -81,13 +82,11 @@ def test_log_likelihoods_are_those_of_the_mixture(finished, matches, part):
     assert 0.8 < np.median(ratio) < 1.25
 
 
-def test_one_part_for_each_piece(finished, matches, part, tmp_path, monkeypatch):
+def test_one_part_for_each_piece(finished, matches, part, tmp_path):
     """Together they say what one part for all says, and parts of more pieces do not stay."""
     fit, posterior = load_fit(finished.path / "fit.nc"), load_posterior(finished.path)
     folder = tmp_path / "stars"
-    assert batches.BATCH > 400
-    monkeypatch.setattr("bayesdist.data.batches.BATCH", 90)
-    write_star_files(matches, fit, posterior, folder)
+    write_star_files(in_batches(matches, 90), fit, posterior, folder)
     parts = part_files(folder)
     assert [p.name for p in parts] == [f"part-{k:05d}.parquet" for k in range(5)]
     both = [pq.read_table(p).to_pydict() for p in parts]
@@ -98,7 +97,6 @@ def test_one_part_for_each_piece(finished, matches, part, tmp_path, monkeypatch)
         else:
             assert joined == values
     (folder / "notes.txt").write_text("mine")
-    monkeypatch.setattr("bayesdist.data.batches.BATCH", 1000)
     write_star_files(matches, fit, posterior, folder)
     assert sorted(snapshot(folder)) == ["notes.txt", "part-00000.parquet"]
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import binomtest, kstest
 
-from bayesdist.data import Matches, batches, open_matches, write_partitioned
+from bayesdist.data import Matches, open_matches, write_partitioned
 from bayesdist.data.preparing import HELD_OUT, HoldoutSpec, exposures_drawn, split_matches
 from bayesdist.errors import InputError
 
@@ -64,20 +64,19 @@ def test_parts_are_disjoint_and_whole():
     assert split.kept.n_rows == len(table)
 
 
-def test_data_on_disk_split_alike_whatever_their_pieces(tmp_path, monkeypatch):
+def test_data_on_disk_split_alike_whatever_their_pieces(tmp_path):
     table, aside = table_of(), HoldoutSpec(0.15, ("b",), 7)
     here = split_matches(table, aside)
     write_partitioned(
         [table.select(np.arange(1500)), table.select(np.arange(1500, 4000))], tmp_path / "m"
     )
     for size in (2**20, 700):
-        monkeypatch.setattr(batches, "BATCH", size)
-        there = split_matches(open_matches(tmp_path / "m"), aside)
+        there = split_matches(open_matches(tmp_path / "m", batch_rows=size), aside)
         for part in ("kept", "held"):
             mine, theirs = getattr(here, part), getattr(there, part)
             assert len(mine) == len(theirs) == sum(len(p) for p in theirs.readers())
             # errors multiplied before and after
-            scaled = open_matches(tmp_path / "m").with_scaled_errors(2.0)
+            scaled = open_matches(tmp_path / "m", batch_rows=size).with_scaled_errors(2.0)
             twice = getattr(split_matches(scaled, aside), part).with_scaled_errors(3.0)
             assert all((p.load().sigma_u == 6.0).all() for p in twice.readers())
             assert places(mine) == places(theirs)

@@ -16,7 +16,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from bayesdist.data import MagnitudeErrors, Matches, batches, open_matches, read_matches
+from bayesdist.data import MagnitudeErrors, Matches, open_matches, read_matches
 from bayesdist.data import repeated as duplicates_module
 from bayesdist.data.magnitude_errors import AddedErrors
 from bayesdist.data.writing import write_partitioned
@@ -60,17 +60,16 @@ def assert_bitwise(found, expected, *, where=""):
     assert found.tobytes() == expected.tobytes(), where
 
 
-def assert_same(path, *, monkeypatch, piece=150, **options):
+def assert_same(path, *, piece=150, **options):
     """All pieces together are what read_matches gives."""
-    monkeypatch.setattr(batches, "BATCH", piece)
     whole = read_matches(path, **options)
-    opened = open_matches(path, **options)
+    opened = open_matches(path, batch_rows=piece, **options)
     for name in SHARED:
         assert getattr(opened, name) == getattr(whole, name), name
     assert len(opened) == len(whole) and opened.exposures == whole.exposures
     parts = [pickle.loads(pickle.dumps(p)) for p in opened.readers()]
     assert all(0 < len(p) <= piece for p in parts)
-    tables, in_memory = ([p.load() for p in some] for some in (parts, whole.readers()))
+    tables, in_memory = ([p.load() for p in some] for some in (parts, whole.readers(piece)))
     assert [len(t) for t in tables] == [len(p) for p in parts] == [t.n_rows for t in tables]
     for name in (*ARRAYS, *CODES):
         of_pieces = [getattr(t, name) for t in tables]
@@ -92,24 +91,24 @@ def assert_same(path, *, monkeypatch, piece=150, **options):
     return opened
 
 
-def test_one_file(rng, tmp_path, monkeypatch):
+def test_one_file(rng, tmp_path):
     columns = {"mag": rng.uniform(10, 20, 500), "colour": rng.uniform(0, 2, 500)}
     path = write(tmp_path / "a.parquet", stars(rng, **columns))
-    assert len(assert_same(path, monkeypatch=monkeypatch).readers()) == 5
-    assert_same(path, monkeypatch=monkeypatch, columns={"mag": ""})
+    assert len(assert_same(path).readers()) == 5
+    assert_same(path, columns={"mag": ""})
 
 
-def test_a_folder_of_parts_and_files_as_exposures(rng, tmp_path, monkeypatch):
+def test_a_folder_of_parts_and_files_as_exposures(rng, tmp_path):
     for k, n in enumerate((330, 20, 250)):
         write(tmp_path / f"p{k}.parquet", stars(rng, n))
-    assert assert_same(tmp_path, monkeypatch=monkeypatch).exposure_names == ("1",)
-    opened = assert_same(str(tmp_path / "*.parquet"), monkeypatch=monkeypatch)
+    assert assert_same(tmp_path).exposure_names == ("1",)
+    opened = assert_same(str(tmp_path / "*.parquet"))
     assert opened.exposure_names == ("p0", "p1", "p2")
     files = [tmp_path / f"p{k}.parquet" for k in (2, 0)]
-    assert assert_same(files, monkeypatch=monkeypatch).exposure_names == ("p2", "p0")
+    assert assert_same(files).exposure_names == ("p2", "p0")
 
 
-def test_labels_are_numbered_through_all_parts(rng, tmp_path, monkeypatch):
+def test_labels_are_numbered_through_all_parts(rng, tmp_path):
     """In the order of first appearance, chips sorted, whatever the type and the encoding."""
     exposures = [["b", "a ", "c"], ["c", "d", "a"]]
     for k in range(2):
@@ -125,45 +124,45 @@ def test_labels_are_numbered_through_all_parts(rng, tmp_path, monkeypatch):
             ),
             group=[130, 400][k],
         )
-    opened = assert_same(tmp_path, monkeypatch=monkeypatch)
+    opened = assert_same(tmp_path)
     assert set(opened.exposure_names) == {"a", "b", "c", "d"}
     assert opened.chip_numbers == (1, 3)
     write(tmp_path / "p2.parquet", stars(
         rng, 9, exposure=np.arange(9) % 2, chip=["1"] * 9, filter=[1.0, 2.5] * 4 + [2.0]
     ))  # fmt: skip
-    opened = assert_same(tmp_path, monkeypatch=monkeypatch)
+    opened = assert_same(tmp_path)
     assert opened.exposure_names[-2:] == ("0", "1")
     assert opened.filter_names[-3:] == ("1", "2.5", "2")
 
 
-def test_a_dictionary_may_hold_more_than_the_rows_do(rng, tmp_path, monkeypatch):
+def test_a_dictionary_may_hold_more_than_the_rows_do(rng, tmp_path):
     codes = pa.array(rng.integers(1, 4, 300).astype(np.int8))
     labels = pa.array(["never", "z", "y", "x"])
     write(
         tmp_path / "a.parquet",
         stars(rng, 300, exposure=pa.DictionaryArray.from_arrays(codes, labels)),
     )
-    names = assert_same(tmp_path / "a.parquet", monkeypatch=monkeypatch).exposure_names
+    names = assert_same(tmp_path / "a.parquet").exposure_names
     assert sorted(names) == ["x", "y", "z"]
 
 
 @pytest.mark.parametrize("point", [None, (120.3, -47.1)])
-def test_sky_positions_share_one_plane(rng, tmp_path, monkeypatch, point):
+def test_sky_positions_share_one_plane(rng, tmp_path, point):
     for k, n in enumerate((301, 77)):
         columns = stars(rng, n, ra=120.3 + rng.normal(0, 0.1, n), dec=-47 + rng.normal(0, 0.1, n))
         del columns["u"], columns["v"]
         write(tmp_path / f"{k}.parquet", columns, group=64, units={"ra": "deg", "su": "mas"})
-    opened = assert_same(tmp_path, monkeypatch=monkeypatch, tangent_point=point)
+    opened = assert_same(tmp_path, tangent_point=point)
     assert opened.unit == "arcsec" and opened.tangent_point == pytest.approx((120.3, -47), abs=0.2)
     with pytest.raises(InputError, match="unit is pix, but sky positions"):
         open_matches(tmp_path, unit="pix")
 
 
-def test_where_errors_come_from(rng, tmp_path, monkeypatch):
+def test_where_errors_come_from(rng, tmp_path):
     bare = {k: v for k, v in stars(rng, mag=rng.uniform(10, 20, 500)).items() if len(k) != 2}
     path = write(tmp_path / "a.parquet", bare, group=170)
-    assert_same(path, monkeypatch=monkeypatch, sigma=0.05)
-    opened = assert_same(path, monkeypatch=monkeypatch, sigma="by_magnitude")
+    assert_same(path, sigma=0.05)
+    opened = assert_same(path, sigma="by_magnitude")
     assert not opened.has_sigma
     bins = np.array([11.0, 14.0, 19.0])
     errors = MagnitudeErrors(bins, bins / 100, bins / 50, bins.astype(int), bins, bins)
@@ -221,11 +220,10 @@ def mirrored(matches):
     return matches.with_columns(x=2049.0 - matches.x)
 
 
-def test_what_is_done_to_stars_on_disk_is_done_when_they_are_read(rng, tmp_path, monkeypatch):
+def test_what_is_done_to_stars_on_disk_is_done_when_they_are_read(rng, tmp_path):
     exposure = np.array(["a", "b", "c"])[rng.integers(3, size=500)]
     path = write(tmp_path / "a.parquet", stars(rng, exp=exposure, mag=rng.uniform(8, 15, 500)))
-    monkeypatch.setattr(batches, "BATCH", 60)
-    whole, opened = read_matches(path), open_matches(path)
+    whole, opened = read_matches(path), open_matches(path, batch_rows=60)
     some = rng.uniform(size=500) < 0.3
     late = np.arange(500) >= 250  # nothing is left of the first batches
     for step in (
@@ -263,15 +261,15 @@ def test_what_takes_stars_in_memory_says_so(rng, tmp_path):
     assert "500 matches on disk" in repr(opened) and "in memory" in repr(opened.load())
 
 
-def test_the_origin_and_units(rng, tmp_path, monkeypatch):
+def test_the_origin_and_units(rng, tmp_path):
     units = {"u": "arcsec", "v": "arcsec", "su": "mas", "sv": "mas"}
     path = write(tmp_path / "a.parquet", stars(rng), units=units)
-    zero = assert_same(path, monkeypatch=monkeypatch, pixel_origin=0)
-    one = assert_same(path, monkeypatch=monkeypatch, unit="arcsec")
+    zero = assert_same(path, pixel_origin=0)
+    one = assert_same(path, unit="arcsec")
     (a, *_), (b, *_) = zero.readers(), one.readers()
     assert (a.load().x == b.load().x + 1).all() and (a.load().u == b.load().u).all()
     path = write(tmp_path / "b.parquet", stars(rng), units={})
-    assert assert_same(path, monkeypatch=monkeypatch, unit="mas").unit == "mas"
+    assert assert_same(path, unit="mas").unit == "mas"
     with pytest.raises(InputError, match="has no unit"):
         open_matches(path)
     with pytest.raises(InputError, match="pixel_origin is 2"):
@@ -280,7 +278,7 @@ def test_the_origin_and_units(rng, tmp_path, monkeypatch):
         open_matches(path, unit="pix", tangent_point=(1.0, 1.0))
 
 
-def test_epochs_in_all_their_forms(rng, tmp_path, monkeypatch):
+def test_epochs_in_all_their_forms(rng, tmp_path):
     days = np.datetime64("2003-02-01") + rng.integers(0, 4000, 300)
     forms = {
         "texts": days.astype(str),
@@ -294,14 +292,14 @@ def test_epochs_in_all_their_forms(rng, tmp_path, monkeypatch):
     }
     for epoch in forms.values():
         path = write(tmp_path / "a.parquet", stars(rng, 300, epoch=epoch), group=60)
-        assert assert_same(path, monkeypatch=monkeypatch, piece=60).has_epoch
+        assert assert_same(path, piece=60).has_epoch
     mjd = 52000 + rng.uniform(0, 4000, 300)
     path = write(
         tmp_path / "a.parquet",
         stars(rng, 300, epoch=mjd),
         units={"u": "pix", "v": "pix", "epoch": "d"},
     )
-    assert_same(path, monkeypatch=monkeypatch)
+    assert_same(path)
 
 
 MOST = 90 if FULL else 25  # rows of a group; some pieces have one row
@@ -330,7 +328,7 @@ def test_any_sizes_of_row_groups_pieces_and_batches(tmp_path_factory, groups, pi
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("bayesdist.data.tables.parquet._BATCH", batch)
         patch.setattr("bayesdist.data.storage.BLOCK", piece + 3)
-        assert_same(folder, monkeypatch=patch, piece=piece, unit="pix")
+        assert_same(folder, piece=piece, unit="pix")
 
 
 def test_small_row_groups_and_files_are_joined(rng, tmp_path):
@@ -340,11 +338,10 @@ def test_small_row_groups_and_files_are_joined(rng, tmp_path):
     assert len(piece) == 1500
 
 
-def test_large_row_groups_are_split_evenly(rng, tmp_path, monkeypatch):
-    assert batches.BATCH == 2**20
-    monkeypatch.setattr(batches, "BATCH", 100)
+def test_large_row_groups_are_split_evenly(rng, tmp_path):
     path = write(tmp_path / "a.parquet", stars(rng, 250), group=250)
-    assert [len(p) for p in open_matches(path).readers()] == [83, 83, 84]
+    assert [len(p) for p in open_matches(path).readers()] == [250]
+    assert [len(p) for p in open_matches(path, batch_rows=100).readers()] == [83, 83, 84]
 
 
 # -- bad input ------------------------------------------------------------------------------------
@@ -578,13 +575,13 @@ def some_tables(rng):
         )  # fmt: skip
 
 
-def test_what_is_written_is_read_back_to_the_last_bit(rng, tmp_path, monkeypatch):
+def test_what_is_written_is_read_back_to_the_last_bit(rng, tmp_path):
     tables = list(some_tables(rng))
     paths = write_partitioned(iter(tables), tmp_path / "a" / "b", rows_per_group=150)
     assert [p.name for p in paths] == [f"part-0000{k}.parquet" for k in range(3)]
     assert [pq.ParquetFile(p).num_row_groups for p in paths] == [5, 1, 2]
     assert sorted(p.name for p in (tmp_path / "a" / "b").iterdir()) == [p.name for p in paths]
-    assert_same(tmp_path / "a" / "b", monkeypatch=monkeypatch)
+    assert_same(tmp_path / "a" / "b")
     back = read_matches(tmp_path / "a" / "b")
     whole = Matches.concatenate(tables)
     assert back.unit == "mas"
@@ -633,11 +630,10 @@ def test_nothing_half_written_stays(rng, tmp_path):
 @pytest.mark.parametrize("take", ["a batch", "a sample"])
 def test_one_batch_at_a_time_is_in_memory(rng, tmp_path, monkeypatch, take):
     """Beside its columns there is a block of rows, and no batch that came before."""
-    monkeypatch.setattr(batches, "BATCH", 200_000)
     monkeypatch.setattr("bayesdist.data.storage.BLOCK", 20_000)
     for name in "abcd":
         write(tmp_path / f"{name}.parquet", stars(rng, 100_000), group=100_000)
-    opened = open_matches(tmp_path)
+    opened = open_matches(tmp_path, batch_rows=200_000)
     first, _ = opened.readers()
     held = sum(column.nbytes for column in first.load()._columns.values())
     tracemalloc.start()
@@ -653,13 +649,13 @@ def test_one_batch_at_a_time_is_in_memory(rng, tmp_path, monkeypatch, take):
 MEASURE = """
 import json, sys, tracemalloc
 import numpy as np, pyarrow as pa
-from bayesdist.data import batches, open_matches, repeated, storage
+from bayesdist.data import open_matches, repeated, storage
 
-batches.BATCH, repeated.HELD = 100_000, 400_000
+repeated.HELD = 400_000
 storage.BLOCK = 50_000
 open_matches(sys.argv[1])  # what is loaded once
 tracemalloc.start()
-opened = open_matches(sys.argv[2])
+opened = open_matches(sys.argv[2], batch_rows=100_000)
 total = sum(batch.x.sum() for batch in opened.batches())
 sample = opened.sample(1000)
 pool = pa.default_memory_pool()

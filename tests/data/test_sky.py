@@ -308,7 +308,7 @@ def test_some_of_the_correlations_of_valid_stars_are_accepted(rng):
     assert impossible > 3
 
 
-def test_batches_without_correlations_are_those_of_one_table(rng, tmp_path, monkeypatch):
+def test_batches_without_correlations_are_those_of_one_table(rng, tmp_path):
     sigma, rho = gaia_star(rng, 1)
     table = gaia_table(np.tile([83.0, -5.0, 2.0, 30.0, -20.0], (300, 1)), sigma, rho)
     table["x"], table["ra"] = np.arange(300) + 1.0, 83.0 + 1e-5 * np.arange(300)
@@ -317,8 +317,7 @@ def test_batches_without_correlations_are_those_of_one_table(rng, tmp_path, monk
     table.write(tmp_path / "gaia.parquet")
     options = {"tangent_point": (83.0, -5.0), "epoch": 2016.0}
     whole = matches_from_table(table, ReadOptions(**options))
-    monkeypatch.setattr("bayesdist.data.batches.BATCH", 100)
-    stored = open_matches(tmp_path / "gaia.parquet", **options).load()
+    stored = open_matches(tmp_path / "gaia.parquet", batch_rows=100, **options).load()
     # parallax factors are those of the middle of a batch
     np.testing.assert_allclose(stored.rho_uv, whole.rho_uv, atol=1e-3)
     assert stored.rho_uv[0] != 0

@@ -25,6 +25,7 @@ from bayesdist.infer import (
     sample,
 )
 from bayesdist.model import Chip, DistortionModel
+from tests.batched import in_batches
 
 SIZE = (1016.0, 508.0)
 BINS = {2: ((5, 4), (12, 1)), 1: ((6, 3), (5, 4))}  # by chip
@@ -119,14 +120,13 @@ def test_a_piece_without_a_chip_adds_nothing(several):
         np.testing.assert_allclose(sums.first, both.binned[key].first, atol=1e-9)
 
 
-def test_one_pass_gives_what_arrays_give(several, monkeypatch):
+def test_one_pass_gives_what_arrays_give(several):
     table, fit = several
     residual, used = residuals(fit, table), fit.uses(table)
     assert used.sum() == fit.n_used < len(table)
     numbers = table.chip_number
     for piece in (10_000, 700):
-        monkeypatch.setattr("bayesdist.data.batches.BATCH", piece)
-        sums = load(fit.model, table).sum(star_sums, *by_fit(fit), BINS)
+        sums = load(fit.model, in_batches(table, piece)).sum(star_sums, *by_fit(fit), BINS)
         assert set(sums.binned) == {
             (chip, bins) for chip, several in BINS.items() for bins in several
         }
@@ -167,13 +167,12 @@ def test_the_task_and_what_it_returns_travel(several):
     np.testing.assert_array_equal(one.binned[2, (5, 4)].second, other.binned[2, (5, 4)].second)
 
 
-def test_stars_flagged_are_those_that_are_flagged_one_by_one(several, monkeypatch):
+def test_stars_flagged_are_those_that_are_flagged_one_by_one(several):
     table, fit = several
     posterior = sample(fit, table, outliers=OutlierMixture(), target_ess=50, target_rhat=1.1)
     flagged = memberships(posterior, table).outlier_probability > 0.5
     expected = [(flagged & (table.exposure == k)).sum() for k in range(3)]
-    monkeypatch.setattr("bayesdist.data.batches.BATCH", 700)
-    found = flagged_by_exposure(load(fit.model, table), posterior)
+    found = flagged_by_exposure(load(fit.model, in_batches(table, 700)), posterior)
     np.testing.assert_array_equal(found, expected)
     assert found.sum() == posterior.n_flagged > 50
     some = star_sample(table.sample(1000), len(table), fit, posterior)

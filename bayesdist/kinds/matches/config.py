@@ -13,6 +13,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 from pydantic import (
     Field,
     PositiveFloat,
+    PositiveInt,
     SerializeAsAny,
     ValidationInfo,
     WrapValidator,
@@ -41,6 +42,7 @@ from bayesdist.app.config.section import (
     names_nominal,
 )
 from bayesdist.data import FORMATS
+from bayesdist.data.batches import BATCH
 from bayesdist.data.formats import mission_formats
 from bayesdist.data.tables.column import length_advice
 from bayesdist.errors import InputError
@@ -66,6 +68,7 @@ class Data(Section):
     motion_prior: PositiveFloat | None = None  # mas per year
     not_finite: Literal["refuse", "reject"] = "refuse"
     same_position: Literal["one_star", "separate_stars"] = "one_star"
+    rows_in_memory: PositiveInt = BATCH
     simulated: bool = False
 
     one_array: ClassVar[bool] = False  # True if matches of this format are from a single chip

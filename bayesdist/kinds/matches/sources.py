@@ -17,6 +17,7 @@ from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.plane import ARCSEC
 from bayesdist.data import Matches, input_files, open_matches, read_matches
+from bayesdist.data.batches import BATCH
 from bayesdist.data.reading.options import ReadArguments
 from bayesdist.data.sky import separation, sky_of_plane
 from bayesdist.data.tables.parquet import describe_part
@@ -26,29 +27,32 @@ from bayesdist.plugin import mission_objects
 
 log = logging.getLogger("bayesdist")
 
-IN_MEMORY = 1_000_000  # rows of Parquet above which tables stay on disk
-
 SAME_POINT = 1e-6  # arcsec, the distance below which tangent points are the same
 
 PathLike = str | os.PathLike[str]
 
 
 def load_matches(
-    path: PathLike | Sequence[PathLike], *, format: str = "auto", **options: Unpack[ReadArguments]
+    path: PathLike | Sequence[PathLike],
+    *,
+    format: str = "auto",
+    rows_in_memory: int = BATCH,
+    **options: Unpack[ReadArguments],
 ) -> Matches:
     """Read matches of any known format; large Parquet tables stay on disk.
 
-    Arguments are those of `read_matches`.
+    Tables of more rows than `rows_in_memory` are processed in batches of at most as many. The
+    other arguments are those of `read_matches`.
     """
-    if format in ("auto", "table") and is_large(path):
+    if format in ("auto", "table") and is_large(path, rows_in_memory):
         if options.pop("not_finite", "refuse") == "reject":
             raise InputError(
-                f"rows of tables of more than {IN_MEMORY} rows cannot be left out in reading",
+                f"rows of tables of more than {rows_in_memory} rows cannot be left out in reading",
                 where="data.not_finite",
                 do="write the table without them",
             )
         options.pop("same_position", None)  # equal positions are searched only in memory
-        return open_matches(path, **options)
+        return open_matches(path, batch_rows=rows_in_memory, **options)
     return read_matches(path, format=format, **options)
 
 
@@ -70,12 +74,12 @@ def reading_options(data: Data, chips: Sequence[ChipBlock]) -> ReadArguments:
     }
 
 
-def is_large(path: PathLike | Sequence[PathLike]) -> bool:
+def is_large(path: PathLike | Sequence[PathLike], rows_in_memory: int) -> bool:
     """True if the files are in Parquet with too many rows to be held in memory."""
     files = input_files(path)
     if any(file.suffix.lower() != ".parquet" for file in files):
         return False
-    return sum(describe_part(file).n_rows for file in files) > IN_MEMORY
+    return sum(describe_part(file).n_rows for file in files) > rows_in_memory
 
 
 Paths = str | Path | Sequence[str | Path]
@@ -122,7 +126,8 @@ def read_configured(
     source = source_of(data.format)
     if source is not None and size is not None:
         return source.read(path, data, size)
-    return load_matches(path, format=data.format, **reading_options(data, chips))
+    options = reading_options(data, chips)
+    return load_matches(path, format=data.format, rows_in_memory=data.rows_in_memory, **options)
 
 
 def read_on_plane(

@@ -7,7 +7,7 @@ import pytest
 from astropy.time import Time
 from scipy.stats import kstest, ncx2
 
-from bayesdist.data import Matches, batches
+from bayesdist.data import Matches
 from bayesdist.diagnose.periods import period_verdict
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer import Rejection, fit_linear
@@ -20,6 +20,7 @@ from bayesdist.infer.compare.periods import (
 from bayesdist.infer.equations.scaled import chi_square
 from bayesdist.infer.stars.stars import prepare
 from bayesdist.model import DistortionModel, TimeDependence
+from tests.batched import in_batches
 from tests.infer.support import CHIP, SIZE, TWO_CHIPS, UNCLIPPED, legendre_design, simulated
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -293,13 +294,13 @@ def test_quoted_errors_that_are_too_small_do_not_make_a_change(rng):
     assert wary.error_scale**2 == pytest.approx(expected, rel=1e-9)
 
 
-def test_pieces_and_parts_of_a_period_add_up(rng, monkeypatch):
+def test_pieces_and_parts_of_a_period_add_up(rng):
     table = dated(rng, 1000)
     fit = fit_linear(table, MODEL)
     whole = period_sums(fit, table, PERIODS)
-    monkeypatch.setattr(batches, "BATCH", 130)
-    assert len(table.readers()) > 5
-    pieces = period_sums(fit, table, PERIODS)
+    cut = in_batches(table, 130)
+    assert len(cut.readers()) > 5
+    pieces = period_sums(fit, cut, PERIODS)
     for name in PERIODS:
         assert pieces[name].n == whole[name].n
         for field in ("weight", "right"):

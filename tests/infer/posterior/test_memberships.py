@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bayesdist.data import batches
 from bayesdist.infer import GaussianPriors, OutlierMixture, load, memberships
 from bayesdist.infer.density.target import Target
 from bayesdist.infer.posterior.memberships import count_outliers, some_draws, star_log_likelihood
+from tests.batched import in_batches
 
 from ..oracle import star_terms
 from ..support import MIXTURES, TWO_CHIPS, posterior_at, residual_of, simulated, table, target_of
@@ -96,14 +96,13 @@ def test_points_are_those_that_were_sampled(known):
     np.testing.assert_allclose(h, psi[:, target.n_theta :], rtol=1e-12, atol=1e-12)
 
 
-def test_outliers_are_counted(known, monkeypatch):
+def test_outliers_are_counted(known):
     target, _, matches, p, _, psi = known
     n = target.n_theta
     # the threshold is not hit by chance
     assert np.abs(p.mean(axis=0) - 0.5).min() > 1e-6
     for piece in (2**20, 90):
-        monkeypatch.setattr(batches, "BATCH", piece)
-        shards = load(target.model, matches)
+        shards = load(target.model, in_batches(matches, piece))
         flagged, expected = count_outliers(shards, target.hyper, psi[:, :n], psi[:, n:])
         assert type(flagged) is int and flagged == (p.mean(axis=0) > 0.5).sum()
         assert expected == pytest.approx(p.mean(axis=0).sum(), rel=1e-10, abs=1e-12)

@@ -27,11 +27,12 @@ import pytest
 from distributed import Client, LocalCluster
 
 from bayesdist import errors
-from bayesdist.data import batches, open_matches
+from bayesdist.data import open_matches
 from bayesdist.infer import Compute, fit_linear, load, sample
 from bayesdist.infer.stars import cluster as cluster_module
 from bayesdist.infer.stars.cluster import ClusterShards
 from bayesdist.infer.stars.shards import Shards
+from tests.batched import in_batches
 from tests.infer.support import TWO_CHIPS, simulated
 from tests.infer.workers import local_workers
 from tests.reduced import only_in_full
@@ -40,16 +41,9 @@ PIECE = 500
 N = 2200  # five pieces on three workers
 
 pytestmark = [
-    pytest.mark.usefixtures("small_pieces", "forked_workers"),
+    pytest.mark.usefixtures("forked_workers"),
     pytest.mark.timeout(120),
 ]
-
-
-@pytest.fixture(scope="module")
-def small_pieces() -> Iterator[None]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(batches, "BATCH", PIECE)
-        yield
 
 
 @pytest.fixture(scope="module")
@@ -68,11 +62,11 @@ def compute(cluster) -> Compute:
 def problem():
     """Model and matches with false matches."""
     model, matches, _ = simulated(11, N, order=3, fraction=0.03)
-    return model, matches
+    return model, in_batches(matches, PIECE)
 
 
 @pytest.fixture(scope="module")
-def by_threads(problem, small_pieces):
+def by_threads(problem):
     """Fit and posterior as threads find them."""
     model, matches = problem
     fit = fit_linear(matches, model)
@@ -88,10 +82,11 @@ def there(problem, compute) -> Iterator[ClusterShards]:
     shards.close()
 
 
-def write(path, matches):
+def write(path, matches, **changes):
     """A Parquet file with row groups as large as a piece."""
+    matches = matches.load()
     columns = {name: getattr(matches, name) for name in "xyuv"}
-    columns |= {"su": matches.sigma_u, "sv": matches.sigma_v}
+    columns |= {"su": matches.sigma_u, "sv": matches.sigma_v, **changes}
     units = {"unit": matches.unit}
     fields = [pa.field(n, pa.float64(), metadata=units if n in "uv" else None) for n in columns]
     table = pa.table([pa.array(c) for c in columns.values()], schema=pa.schema(fields))
@@ -185,9 +180,9 @@ def test_table_in_memory(problem, compute, by_threads):
 
 def test_table_in_memory_by_files(problem, compute, by_threads, tmp_path):
     model, matches = problem
-    shards = load(model, matches, replace(compute, scratch=str(tmp_path)))
+    shards = load(model, matches.load(), replace(compute, scratch=str(tmp_path)))
     try:
-        assert len(list(tmp_path.rglob("*.h5"))) == len(matches.readers())
+        assert [path.name for path in tmp_path.rglob("*.h5")] == ["000000.h5"]
         assert_same_fit(fit_linear(shards, model), by_threads[0])
     finally:
         shards.close()
@@ -199,14 +194,14 @@ def test_table_on_disk_by_a_relative_path(problem, compute, by_threads, tmp_path
     model, matches = problem
     write(tmp_path / "stars.parquet", matches)
     monkeypatch.chdir(tmp_path)
-    opened = open_matches("stars.parquet")
+    opened = open_matches("stars.parquet", batch_rows=PIECE)
     assert len(opened.readers()) == 5
     (tmp_path / "scratch").mkdir()
     shards = load(model, opened, replace(compute, scratch=str(tmp_path / "scratch")))
     try:
         assert len(shards) == N
         assert not list(tmp_path.rglob("*.h5"))  # they are files already
-        assert np.concatenate(shards.sum(first_shard)).tobytes() == matches.u.tobytes()
+        assert np.concatenate(shards.sum(first_shard)).tobytes() == matches.load().u.tobytes()
         assert_same_fit(fit_linear(shards, model), by_threads[0])
         assert_same_draws(sample(by_threads[0], shards, seed=5), by_threads[1])
     finally:
@@ -216,14 +211,15 @@ def test_table_on_disk_by_a_relative_path(problem, compute, by_threads, tmp_path
 def test_pieces_that_hold_other_exposures(compute):
     model, matches, _ = simulated(3, N, frames="shift_rotation", n_exposures=4, chips=TWO_CHIPS)
     matches = matches.select(np.argsort(matches.exposure, kind="stable"))
+    matches = in_batches(matches, PIECE)
     assert_same_fit(fit_linear(matches, model, compute=compute), fit_linear(matches, model))
 
 
 @pytest.mark.parametrize("n_shards", [3, 5, 12])
-def test_shards_are_spread_evenly_and_stay(problem, compute, n_shards, monkeypatch):
+def test_shards_are_spread_evenly_and_stay(problem, compute, n_shards):
     """Only sums travel: no shard has been copied after some passes."""
-    monkeypatch.setattr(batches, "BATCH", -(-N // n_shards))
-    shards = load(*problem, compute)
+    model, matches = problem
+    shards = load(model, in_batches(matches.load(), -(-N // n_shards)), compute)
     pids = shards.sum(pid_of)
     assert len(pids) == n_shards
     counts = [pids.count(pid) for pid in set(pids)]
@@ -398,10 +394,10 @@ def test_bad_row_found_by_a_worker(problem, compute, tmp_path):
     """The file has got a NaN since it was opened: the sentence is that of threads."""
     model, matches = problem
     path = write(tmp_path / "stars.parquet", matches)
-    opened = open_matches(path)
-    matches.v[1234], kept = np.nan, matches.v[1234]
-    write(path, matches)
-    matches.v[1234] = kept
+    opened = open_matches(path, batch_rows=PIECE)
+    v = matches.load().v.copy()
+    v[1234] = np.nan
+    write(path, matches, v=v)
     said = []
     for engine in (Compute(), compute):
         with pytest.raises(errors.InputError) as caught:

@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bayesdist.data import batches
 from bayesdist.errors import InputError
 from bayesdist.infer import Compute, GaussianPriors, OutlierMixture, fit_linear, load
 from bayesdist.infer.density.target import Target
 from bayesdist.infer.stars import shards as store
 from bayesdist.infer.stars.shards import Store
+from tests.batched import in_batches
 
 from ..support import TWO_CHIPS, pieces, simulated, stars_of
 
@@ -184,10 +184,10 @@ def test_a_scratch_folder_that_is_not_there_is_one_sentence(shards, tmp_path, mo
         Store(0).add(shards[0])
 
 
-def test_the_fit_and_the_density_do_not_depend_on_the_budget(campaign, monkeypatch):
+def test_the_fit_and_the_density_do_not_depend_on_the_budget(campaign):
     """memory_mb = 0: everything from the scratch file, at every pass."""
     model, matches, _ = campaign
-    monkeypatch.setattr(batches, "BATCH", 300)
+    matches = in_batches(matches, 300)
     mixture = OutlierMixture()
     fits, densities, expansions = [], [], []
     for memory_mb in (1000.0, 0.02, 0.0):

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bayesdist.data import batches, open_matches, write_partitioned
+from bayesdist.data import open_matches, write_partitioned
 from bayesdist.errors import InputError
 from bayesdist.infer import Compute, GaussianPriors, OutlierMixture, Rejection, fit_linear, load
 from bayesdist.infer.density.target import Target
@@ -19,6 +19,7 @@ from bayesdist.infer.stars.likelihood import Clip
 from bayesdist.infer.stars.shards import total
 from bayesdist.infer.stars.stars import in_table_order, prepare
 from bayesdist.model import DistortionModel, TimeDependence
+from tests.batched import in_batches
 from tests.reduced import case_in_full
 
 from ..support import CHIP, TWO_CHIPS, residual_of, simulated
@@ -87,22 +88,20 @@ def assert_same(found, expected, rel=1e-12):
 
 
 @pytest.mark.parametrize("size", [case_in_full(1, instead="larger pieces are run"), 37, 500, 1200])
-def test_pieces_of_a_table(campaign, monkeypatch, size):
+def test_pieces_of_a_table(campaign, size):
     model, matches, theta = campaign
     whole = load(model, matches)
     assert len(matches.readers()) == 1
-    monkeypatch.setattr(batches, "BATCH", size)
-    assert len(matches.readers()) == -(-1200 // size)
-    cut = load(model, matches)
+    assert len(matches.readers(size)) == -(-1200 // size)
+    cut = load(model, in_batches(matches, size))
     assert len(cut) == len(whole) == 1200 and cut.groups.same(whole.groups)
     assert_same(sums_of(cut, theta), sums_of(whole, theta))
 
 
 @pytest.mark.parametrize("piece", [130, 400, 2**20])
-def test_parts_on_disk(campaign, parquet, monkeypatch, piece):
+def test_parts_on_disk(campaign, parquet, piece):
     model, matches, theta = campaign
-    monkeypatch.setattr(batches, "BATCH", piece)
-    on_disk = open_matches(parquet)
+    on_disk = open_matches(parquet, batch_rows=piece)
     assert (len(on_disk.readers()) == 1) == (piece > 1200)
     model = _in_order_of(model, on_disk.exposure_names)
     renamed = _with_names_of(matches, on_disk.exposure_names)
@@ -150,11 +149,10 @@ def _small():
     return model, matches, truth.theta
 
 
-def test_the_fit_does_not_depend_on_the_pieces(campaign, parquet, monkeypatch):
+def test_the_fit_does_not_depend_on_the_pieces(campaign, parquet):
     model, matches, _ = campaign
     whole = fit_linear(matches, model, rejection=Rejection(radial_weight=2.0))
-    monkeypatch.setattr(batches, "BATCH", 100)
-    cut = fit_linear(matches, model, rejection=Rejection(radial_weight=2.0))
+    cut = fit_linear(in_batches(matches, 100), model, rejection=Rejection(radial_weight=2.0))
     np.testing.assert_allclose(
         cut.mean / whole.sigma, whole.mean / whole.sigma, rtol=1e-11, atol=1e-5
     )
@@ -164,21 +162,21 @@ def test_the_fit_does_not_depend_on_the_pieces(campaign, parquet, monkeypatch):
     np.testing.assert_array_equal(cut.uses(matches), whole.uses(matches))
 
 
-def test_a_model_need_not_know_the_exposures_that_it_has_no_frames_for(campaign, monkeypatch):
+def test_a_model_need_not_know_the_exposures_that_it_has_no_frames_for(campaign):
     """One polynomial for all exposures, of which pieces hold some and other ones."""
     _, matches, _ = simulated(113, 300, n_exposures=4)
     model = DistortionModel(2, (CHIP,))
     whole = fit_linear(matches, model)
-    monkeypatch.setattr(batches, "BATCH", 50)  # the exposures stand one after the other
-    cut = fit_linear(matches, model)
+    # the exposures stand one after the other
+    cut = fit_linear(in_batches(matches, 50), model)
     np.testing.assert_allclose(cut.mean, whole.mean, rtol=1e-12)
     assert load(model, matches).survey.exposures.shape == (1,)
 
 
-def test_results_add_up_in_the_order_of_the_data(campaign, monkeypatch):
+def test_results_add_up_in_the_order_of_the_data(campaign):
     """A sum of doubles depends on its order: the order is that of the rows."""
     model, matches, _ = campaign
-    monkeypatch.setattr(batches, "BATCH", 300)
+    matches = in_batches(matches, 300)
     shards = load(model, matches)
     first = shards.sum(_first_u)
     assert first == tuple(
@@ -260,7 +258,7 @@ def test_a_budget_that_is_no_budget_is_refused(memory):
 
 
 @pytest.mark.parametrize("in_order", [False, True], ids=["mixed", "assumed motions last"])
-def test_the_scale_of_priors_is_that_of_stars_with_a_measured_motion(monkeypatch, in_order):
+def test_the_scale_of_priors_is_that_of_stars_with_a_measured_motion(in_order):
     """With 60 % of assumed motions, in several pieces, some of which may have no others."""
     rng, n = np.random.default_rng(12), 600
     assumed = rng.random(n) < 0.6
@@ -270,11 +268,10 @@ def test_the_scale_of_priors_is_that_of_stars_with_a_measured_motion(monkeypatch
     sigma = np.where(assumed, 2.0, rng.uniform(0.02, 0.06, n))
     marked = matches.with_errors((sigma, sigma)).with_columns(assumed_motion=assumed.astype(int))
     middle = np.sqrt(np.median(sigma[~assumed] ** 2))
-    monkeypatch.setattr(batches, "BATCH", 150)
-    with closing(load(model, marked)) as shards:
+    with closing(load(model, in_batches(marked, 150))) as shards:
         assert shards.survey.reference_sigma == pytest.approx(middle, rel=1e-9)
     none = marked.with_columns(assumed_motion=np.ones(n, int))
-    with closing(load(model, none)) as shards:
+    with closing(load(model, in_batches(none, 150))) as shards:
         assert shards.survey.reference_sigma == pytest.approx(
             np.sqrt(np.median(sigma**2)), rel=1e-9
         )

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
-from bayesdist.data import batches
 from bayesdist.infer import load
 from bayesdist.infer.stars.shards import survey, total
 from bayesdist.infer.stars.stars import prepare
+from tests.batched import in_batches
 
 from ..support import CHIP, TWO_CHIPS, pieces, simulated, table
 
@@ -155,11 +155,10 @@ def test_the_hull_of_many_stars_is_that_of_all():
         assert {tuple(c) for c in found.corners} == {tuple(p) for p in hull.points[hull.vertices]}
 
 
-def test_shards_survey_their_pieces(campaign, monkeypatch):
+def test_shards_survey_their_pieces(campaign):
     model, matches = campaign
     whole = load(model, matches).survey
-    monkeypatch.setattr(batches, "BATCH", 700)
-    cut = load(model, matches).survey
+    cut = load(model, in_batches(matches, 700)).survey
     assert cut.n == whole.n and cut.where == whole.where
     assert cut.reference_sigma == whole.reference_sigma  # the same stars, all of them
     np.testing.assert_array_equal(cut.exposures, whole.exposures)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
@@ -13,7 +15,6 @@ from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data import Matches, read_matches, write_partitioned
 from bayesdist.data.storage import StoredRows
 from bayesdist.infer import load_fit, load_posterior
-from bayesdist.kinds.matches import sources as app_matches
 from bayesdist.kinds.matches.sources import load_matches
 from bayesdist.model import TimeDependence
 from bayesdist.simulate import simulate_matches
@@ -34,13 +35,6 @@ from tests.reduced import only_in_full
 N = 6000
 
 
-@pytest.fixture
-def on_disk(monkeypatch):
-    """Tables of this size stay on disk, in pieces of 1700 rows."""
-    monkeypatch.setattr(app_matches, "IN_MEMORY", 1000)
-    monkeypatch.setattr("bayesdist.data.batches.BATCH", 1700)
-
-
 @pytest.fixture(scope="module")
 def job(tmp_path_factory):
     """A folder of three parts, and a configuration that names it by its whole path."""
@@ -48,7 +42,11 @@ def job(tmp_path_factory):
     matches, _ = simulated(N, seed=4, mag=np.linspace(12.0, 18.0, N))
     thirds = [matches.select(np.arange(k, N, 3)) for k in range(3)]
     write_partitioned(thirds, folder / "stars", rows_per_group=500)
-    return write_config(folder / "config.toml", data={"matches": str(folder / "stars")})
+    return _job(folder / "config.toml", folder / "stars", rows_in_memory=1700)
+
+
+def _job(path, stars, **data):
+    return write_config(path, data={"matches": str(stars), **data})
 
 
 def _numbers(value, path=""):
@@ -62,27 +60,25 @@ def _numbers(value, path=""):
         yield path, value
 
 
-def test_which_stay_on_disk(job, monkeypatch, tmp_path):
-    """Parquet of more rows than IN_MEMORY, as one file or several; nothing else."""
+def test_which_stay_on_disk(job, tmp_path):
+    """Parquet of more than `rows_in_memory` rows, as one file or several; nothing else."""
     folder = job.parent / "stars"
     files = sorted(folder.iterdir())
     for limit, in_memory in ((N, True), (N - 1, False)):
-        monkeypatch.setattr(app_matches, "IN_MEMORY", limit)
         for path in (folder, str(folder / "*.parquet"), files):
-            assert load_matches(path).in_memory is in_memory
-        assert load_matches(folder, format="table").in_memory is in_memory
-    monkeypatch.setattr(app_matches, "IN_MEMORY", 1)
+            assert load_matches(path, rows_in_memory=limit).in_memory is in_memory
+        found = load_matches(folder, format="table", rows_in_memory=limit)
+        assert found.in_memory is in_memory
     table = read_matches(files[0])
     as_table(table).write(tmp_path / "stars.ecsv")
-    assert load_matches(tmp_path / "stars.ecsv").in_memory
+    assert load_matches(tmp_path / "stars.ecsv", rows_in_memory=1).in_memory
 
 
-def test_a_run_on_disk_is_the_run_in_memory(job, tmp_path, on_disk, monkeypatch):
+def test_a_run_on_disk_is_the_run_in_memory(job, tmp_path):
     stages = ("fit", "sample", "assess")
     disk = begin_stagewise(tmp_path / "disk", job, *stages)
-    monkeypatch.setattr(app_matches, "IN_MEMORY", 10 * N)
-    monkeypatch.setattr("bayesdist.data.batches.BATCH", 2**20)
-    memory = begin_stagewise(tmp_path / "memory", job, *stages)
+    whole = _job(tmp_path / "config.toml", job.parent / "stars")
+    memory = begin_stagewise(tmp_path / "memory", whole, *stages)
 
     one, other = load_fit(disk / "fit.nc"), load_fit(memory / "fit.nc")
     # sums over pieces round otherwise: far less than a formal error
@@ -109,7 +105,7 @@ def test_a_run_on_disk_is_the_run_in_memory(job, tmp_path, on_disk, monkeypatch)
 
 
 @pytest.mark.usefixtures("figures_made")
-def test_no_stage_takes_all_rows_into_memory(job, tmp_path, on_disk, monkeypatch):
+def test_no_stage_takes_all_rows_into_memory(job, tmp_path, monkeypatch):
     """The largest table that is ever made has the rows of one piece, or of the sample."""
     sizes = []
     complete = Matches._complete
@@ -119,6 +115,8 @@ def test_no_stage_takes_all_rows_into_memory(job, tmp_path, on_disk, monkeypatch
     for name in ("app.stars", "kinds.matches.kind", "kinds.matches.init"):
         monkeypatch.setattr(f"bayesdist.{name}.SAMPLE", 900)
     monkeypatch.setattr("bayesdist.infer.solution.linear.MEDIAN_STARS", 900)
+    on_disk = partial(load_matches, rows_in_memory=1700)
+    monkeypatch.setattr("bayesdist.kinds.matches.init.load_matches", on_disk)
     good("init", tmp_path / "c.toml", "--matches", job.parent / "stars")
     good("check", job)
     run = tmp_path / "run"
@@ -131,22 +129,21 @@ def test_no_stage_takes_all_rows_into_memory(job, tmp_path, on_disk, monkeypatch
 
 @pytest.mark.slow
 @only_in_full("the run on disk is that in memory")
-def test_the_data_are_read_once_for_all_passes(job, tmp_path, on_disk):
+def test_the_data_are_read_once_for_all_passes(job, tmp_path):
     """The scan, the median position, the passes, what is said of each star, and the sample."""
     read = []
     real = StoredRows.load
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(StoredRows, "load", lambda self: (read.append(1), real(self))[1])
         good("run", job, "-o", tmp_path / "run")
-    pieces = len(load_matches(job.parent / "stars").readers())
+    pieces = len(load_matches(job.parent / "stars", rows_in_memory=1700).readers())
     assert len(read) == 4 * pieces
 
 
-def test_sums_over_pieces_are_those_of_the_whole(job, tmp_path, on_disk, monkeypatch):
-    config, text = load_config(job)
+def test_sums_over_pieces_are_those_of_the_whole(job, tmp_path):
     sums = []
-    for limit in (1000, 10 * N):
-        monkeypatch.setattr(app_matches, "IN_MEMORY", limit)
+    for path in (job, _job(tmp_path / "whole.toml", job.parent / "stars")):
+        config, text = load_config(path)
         run = RunDirectory.plan(tmp_path / "none", config, text, job.parent)
         with Run.of(run) as results:
             sums.append(fit(results).diagnostics.sums)
@@ -164,7 +161,7 @@ def test_sums_over_pieces_are_those_of_the_whole(job, tmp_path, on_disk, monkeyp
 
 @pytest.mark.slow
 @only_in_full("test_kinds_of_data has such errors in memory")
-def test_errors_by_magnitude_on_disk(tmp_path, on_disk):
+def test_errors_by_magnitude_on_disk(tmp_path):
     """From the residuals of a sample, given to all: a bright star is good to 0.01 px."""
 
     def quoted(mag):
@@ -176,7 +173,11 @@ def test_errors_by_magnitude_on_disk(tmp_path, on_disk):
         N, seed=10, mag=rng.uniform(12, 18, N), sigma=quoted, jitter=0.0, fraction=0.02
     )
     write_partitioned([matches], tmp_path / "stars", rows_per_group=500)
-    data = {"matches": str(tmp_path / "stars"), "sigma": "by_magnitude"}
+    data = {
+        "matches": str(tmp_path / "stars"),
+        "sigma": "by_magnitude",
+        "rows_in_memory": 1700,
+    }
     exact = {"name": "reference catalogue", "kind": "random", "sigma_u": 0.0, "sigma_v": 0.0}
     budget = [exact | {"source": "exact in the simulation"}]
     config = write_config(tmp_path / "c.toml", data=data, budget=budget)
@@ -189,7 +190,7 @@ def test_errors_by_magnitude_on_disk(tmp_path, on_disk):
 
 @pytest.mark.slow
 @only_in_full("the run on disk is that in memory")
-def test_the_epoch_of_the_assessment_is_the_latest_of_the_data(tmp_path, on_disk):
+def test_the_epoch_of_the_assessment_is_the_latest_of_the_data(tmp_path):
     names = ("a", "b", "c")
     model = model_of(time=TimeDependence((("u", 1, 0),), (2004.5,)), exposures=names)
     matches, _ = simulate_matches(
@@ -199,7 +200,7 @@ def test_the_epoch_of_the_assessment_is_the_latest_of_the_data(tmp_path, on_disk
     write_partitioned([matches], tmp_path / "stars", rows_per_group=500)
     config = write_config(
         tmp_path / "c.toml",
-        data={"matches": str(tmp_path / "stars")},
+        data={"matches": str(tmp_path / "stars"), "rows_in_memory": 1700},
         **{"model.tdd": {"epoch0": 2004.5, "terms": [["u", 1, 0]]}},
     )
     run = partly_run(tmp_path / "run", config, "fit", "sample", "assess")

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from bayesdist.app import stages
-from bayesdist.kinds.matches import sources as app_matches
+from bayesdist.kinds.matches.sources import load_matches
 from tests.app.support import (
     begin_stagewise,
     model_of,
@@ -29,11 +30,6 @@ from tests.app.support import (
 from tests.reduced import only_in_full
 
 N, PART, GROUP = 20_000, 10_000, 1_000
-
-
-@pytest.fixture(autouse=True)
-def on_disk(monkeypatch):
-    monkeypatch.setattr(app_matches, "IN_MEMORY", 1000)
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +54,7 @@ def job(tmp_path, stars) -> Path:
     (tmp_path / "stars").mkdir()
     for k in range(2):
         write(tmp_path / "stars" / f"{'ab'[k]}.parquet", stars.slice(k * PART, PART))
-    return write_config(tmp_path / "c.toml", data={"matches": "stars"})
+    return write_config(tmp_path / "c.toml", data={"matches": "stars", "rows_in_memory": PART})
 
 
 Change = Callable[[pa.Table], pa.Table]
@@ -156,10 +152,12 @@ DAMAGE: dict[str, tuple[Callable[[Path], object], list[str]]] = {
 
 
 @pytest.mark.parametrize("case", DAMAGE)
-def test_a_damaged_part(job, case):
+def test_a_damaged_part(job, case, monkeypatch):
     damage, words = DAMAGE[case]
     damage(job.parent / "stars" / "b.parquet")
     refused(job.parent, "run", job, "-o", job.parent / "run", words=words)
+    on_disk = partial(load_matches, rows_in_memory=PART)
+    monkeypatch.setattr("bayesdist.kinds.matches.init.load_matches", on_disk)
     refused(job.parent, "init", job.parent / "new.toml", "--matches", job.parent / "stars",
             words=words)  # fmt: skip
 
@@ -167,18 +165,18 @@ def test_a_damaged_part(job, case):
 @pytest.mark.slow
 @only_in_full("test_bad_input has a shell")
 def test_the_same_from_a_shell(tmp_path, stars):
-    """In a process of its own, where more than a million rows stay on disk."""
+    """In a process of its own."""
     (tmp_path / "stars").mkdir()
-    for k in range(51):
+    for k in range(3):
         moved = stars.set_column(0, stars.schema.field("x"), pa.array(
             np.clip(stars["x"].to_numpy() + 1e-6 * k, 0.5, 1000.5)
         ))  # fmt: skip
         write(tmp_path / "stars" / f"{k:02d}.parquet", moved)
-    _flip(tmp_path / "stars" / "50.parquet", 19, 2)
-    config = write_config(tmp_path / "c.toml", data={"matches": "stars"})
+    _flip(tmp_path / "stars" / "02.parquet", 19, 2)
+    config = write_config(tmp_path / "c.toml", data={"matches": "stars", "rows_in_memory": PART})
     done = process("run", config, "-o", tmp_path / "run", "-q", cwd=tmp_path)
     assert done.returncode == 1 and done.stdout == ""
-    one_sentence(done.stderr, "50.parquet, row group 20 of 20 (rows 19001 to 20000)")
+    one_sentence(done.stderr, "02.parquet, row group 20 of 20 (rows 19001 to 20000)")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["c.toml", "stars"]
 
 
@@ -226,7 +224,6 @@ def test_a_part_that_vanishes_before_it_is_written_about(job, tmp_path, monkeypa
         real(*arguments)
         path.rename(kept)
 
-    monkeypatch.setattr("bayesdist.data.batches.BATCH", PART)
     monkeypatch.setattr(stages, "_write_part", vanish)
     result = cli("stage", "sample", run, "-q")
     assert result.code == 1
@@ -242,5 +239,7 @@ def test_a_part_that_vanishes_before_it_is_written_about(job, tmp_path, monkeypa
 
 def begin_stagewise_here(job: Path, tmp_path: Path) -> Path:
     """A run after its fit."""
-    config = write_config(tmp_path / "full.toml", data={"matches": str(job.parent / "stars")})
+    config = write_config(
+        tmp_path / "full.toml", data={"matches": str(job.parent / "stars"), "rows_in_memory": PART}
+    )
     return begin_stagewise(tmp_path / "run", config, "fit")

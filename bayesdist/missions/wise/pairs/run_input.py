@@ -19,6 +19,7 @@ import numpy as np
 
 from bayesdist.app.store.rundir import PAIRS, RunDirectory, part_files
 from bayesdist.data import Matches, input_files, open_matches, write_partitioned
+from bayesdist.data.batches import BATCH
 from bayesdist.data.columns import merged_counts
 from bayesdist.data.tables.checks import Place, counted
 from bayesdist.data.tables.names import ALIASES
@@ -66,6 +67,7 @@ def open_rvb(
     sigma: str | float,
     pixel_origin: int,
     size: tuple[float, float],
+    batch_rows: int = BATCH,
 ) -> Matches | None:
     """Open the RvB pairs of one band without reading them into memory; see `stream_rvb`.
 
@@ -91,7 +93,14 @@ def open_rvb(
     named = {key: column_of.get(key, "") for key in ALIASES}
     # exclude quantities that could be mistaken for columns of frames and bands
     named |= {"ra": "", "dec": "", "chip": "", "colour": "", "filter": column_of.get("band", "")}
-    return open_matches(path, columns=named, unit=unit, sigma=sigma, pixel_origin=pixel_origin)
+    return open_matches(
+        path,
+        columns=named,
+        unit=unit,
+        sigma=sigma,
+        pixel_origin=pixel_origin,
+        batch_rows=batch_rows,
+    )
 
 
 def _row_name(file: RvbFile, place: Place, k: int) -> str:
@@ -135,14 +144,14 @@ class RvbInput:
         data, size = self.data, self.size
         path = self.run.config.named_files(self.run.base)
         options = _options(data, size)
-        if not is_large(path):
+        if not is_large(path, data.rows_in_memory):
             return load_rvb(path, data, size)
         if data.band is not None:
             _require_array(data.band, size)
         if "pairs" in self.run.facts and part_files(self.run / PAIRS):
             return self._opened(self.run / PAIRS, self.run.facts["pairs"])
         if data.rvb.takes_all:
-            opened = open_rvb(path, **options)
+            opened = open_rvb(path, **options, batch_rows=data.rows_in_memory)
             if opened is not None:
                 for band in opened.filter_names:
                     _require_array(band or data.band, size)
@@ -183,7 +192,8 @@ class RvbInput:
         options = _options(self.data, self.size)
         # errors given as a number were written to the columns
         sigma = options["sigma"] if options["sigma"] == "by_magnitude" else "columns"
-        opened = open_matches(folder, unit=options["unit"], sigma=sigma)
+        rows = self.data.rows_in_memory
+        opened = open_matches(folder, unit=options["unit"], sigma=sigma, batch_rows=rows)
         rejected = counts["rejected"]
         return opened.with_counts(len(opened) + sum(rejected.values()), rejected)
 
