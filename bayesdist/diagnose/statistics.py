@@ -30,6 +30,8 @@ from bayesdist.utils.arrays import Bool, Float, Int
 from bayesdist.utils.distributions import beta_ppf, beta_sf, chi2_isf
 
 MIN_P = 1e-300  # avoids underflow: no p-value is zero
+# largest p-value that is combined with others, so that one near 1 does not hide those below 1e-3
+LARGEST_COMBINED = 0.99
 
 
 def sums_over(cluster: Int, values: Float, n: int = 0) -> Float:
@@ -215,6 +217,17 @@ def holm(p_values: ArrayLike) -> Float:
     steps = np.arange(len(p), 0, -1) * p[order]
     out[order] = np.minimum(np.maximum.accumulate(steps), 1.0)
     return out
+
+
+def combined_p(p_values: ArrayLike, weights: ArrayLike) -> float:
+    """P-value of the sum of p-values (m,) that were transformed to a Cauchy distribution.
+
+    Small results are exact for tests that depend on each other in any way (Liu and Xie 2020, J. Am.
+    Stat. Assoc. 115, 393).  The weights (m,) add up to 1.
+    """
+    p = np.clip(np.asarray(p_values, float), MIN_P, LARGEST_COMBINED)
+    t = float(np.asarray(weights, float) @ (1.0 / np.tan(np.pi * p)))
+    return float(np.arctan2(1.0, t) / np.pi)
 
 
 def hotelling_p(statistic: float, dof: float, n: float) -> float:

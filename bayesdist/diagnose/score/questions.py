@@ -3,13 +3,24 @@
 The list serves matched stars, campaigns and self-calibrations.  The functions of the detections
 that a question adds to the model determine everything else: how parameters and stars are projected
 out of them, the statistic, its p-value and the smallest effect that would have been detected.
+
+A test of many directions is insensitive to each of them.  Where the likely effect is known, its
+patterns are tested one by one in addition.  Trails of charge displace stars along one axis, in
+proportion to the number of pixels to the amplifier, and more so the fainter they are; stars that
+are so bright that they change the field in the silicon are displaced in proportion to their flux.
+The p-values of all these tests, p_i, are combined into one (Liu and Xie 2020):
+
+    p = 1/2 - arctan(t) / pi        t = sum of w_i tan((1/2 - p_i) pi)        sum of w_i = 1
+
+Small values of it are exact for tests that depend on each other in any way: patterns that resemble
+each other count as one, whereas a Bonferroni correction would count them all.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from itertools import pairwise
 
 import numpy as np
@@ -18,9 +29,11 @@ from scipy.linalg import block_diag
 
 from bayesdist.diagnose.score.result import LOOK_UP_TABLE, Family, Outcome
 from bayesdist.diagnose.score.sample import ScoredSample
+from bayesdist.diagnose.statistics import MIN_P, combined_p
 from bayesdist.model.basis import MAX_ORDER, n_terms, polynomial_terms
 from bayesdist.model.timedep import TimeDependence
 from bayesdist.utils.arrays import Bool, Float, Int
+from bayesdist.utils.distributions import chi2_isf, f_isf
 
 Terms = tuple[tuple[int, int], ...]
 CONSTANT, LINEAR = polynomial_terms(0), polynomial_terms(1)
@@ -102,6 +115,8 @@ CURVATURE = Family(
 # smallest standard deviation of values, in magnitudes or in units of half the time span
 MIN_DEVIATION = 1e-9
 SAYS_NOTHING = 0.2  # p-value above which an adjusted test counts as insignificant
+# weight of the test of all directions, when its p-value is combined with those of single patterns
+WEIGHT_OF_ALL = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,6 +144,8 @@ class Question:
     # group of families that a second test fits as well; if that test is insignificant, its result
     # is used
     adjusted_for: str = ""
+    # likely patterns, which are also tested one by one; their terms are `LINEAR`
+    patterns: tuple[Products, ...] = ()
 
 
 def order_family(total: int, order: int) -> Family:
@@ -151,7 +168,9 @@ def questions(sample: ScoredSample) -> Iterator[Question]:
         terms = polynomial_terms(total)[n_terms(total - 1) :]
         yield Question(order_family(total, order), (Products(terms),))
     if sample.mag is not None:
-        yield Question(MAGNITUDE, (Products(LINEAR, _standing_out(sample.mag)),))
+        magnitude = Products(LINEAR, _standing_out(sample.mag))
+        flux = Products(LINEAR, _standing_out(_relative_flux(sample.mag)))
+        yield Question(MAGNITUDE, (magnitude,), patterns=(magnitude, flux))
     if sample.offset is not None and sample.position is not None:
         # effect, to first order, of a curved sky on the tangent planes of exposures
         p, q = sample.position
@@ -237,6 +256,12 @@ def _standing_out(values: Float) -> Float:
     return np.asarray(inside - inside.mean())
 
 
+def _relative_flux(mag: Float) -> Float:
+    """Flux (N,) relative to that of the brightest stars, whose magnitudes may be codes."""
+    brightest = np.percentile(mag, OUTSIDE)
+    return np.asarray(10.0 ** (-0.4 * np.maximum(mag - brightest, 0.0)))
+
+
 def _beyond_lines(half: Float, time: TimeDependence, epoch: Float) -> Float:
     """Square of the time, minus its fit by a constant and by the linear segments of the model."""
     design = np.column_stack([np.ones(len(half)), time.weights(epoch)])
@@ -259,6 +284,7 @@ class Regressors:
     # indices of functions that are fitted as well, so that they are not mistaken for the tested
     # ones
     adjusted_for: Int
+    is_pattern: bool = False  # True for one of the likely patterns of a question
 
     @property
     def every(self) -> Int:
@@ -367,7 +393,18 @@ def functions_for(sample: ScoredSample, asked: Iterable[Question] | None = None)
         start += len(functions)
         groups.setdefault(question.family.group, []).append(functions)
         none = np.zeros(0, np.int64)
-        regressors.append(Regressors(question.family, functions, combination, question.least, none))
+        tested = Regressors(question.family, functions, combination, question.least, none)
+        regressors.append(tested)
+        for pattern in question.patterns:
+            of_pattern = functions
+            if pattern not in question.products:
+                of_pattern = start + np.arange(len(pattern.terms))
+                products.append(pattern)
+                start += len(pattern.terms)
+            regressors += [
+                replace(tested, functions=of_pattern, combination=rising, is_pattern=True)
+                for rising in _rising_from_edges()
+            ]
         if question.adjusted_for:
             adjustment = np.concatenate([none, *groups.get(question.adjusted_for, [])])
             regressors.append(
@@ -392,14 +429,68 @@ def _along_axes(several: Iterable[Products], n_detections: int) -> tuple[list[Pr
     return parts, np.asarray(block_diag(*blocks))
 
 
-def one_of_each(found: Iterable[tuple[Regressors, Outcome]]) -> list[Outcome]:
-    """Outcomes with one test per question: the adjusted test if it is insignificant.
+def _rising_from_edges() -> Iterator[Float]:
+    """Iterate over displacements along one axis that rise in proportion to the distance on it.
 
-    Adjusting for other functions reduces the power of a test but does not remove a real effect.
+    The distance is that from the first or the last column for displacements along x, and from the
+    first or the last row for those along y.  They are combinations (6, 1) of both axes of `LINEAR`.
     """
-    pairs = [(len(several.adjusted_for) > 0, result) for several, result in found]
-    out = {result.name: result for adjusted, result in pairs if not adjusted}
-    for adjusted, result in pairs:
-        if adjusted and result.name in out and result.p_value > SAYS_NOTHING:
+    constant = LINEAR.index((0, 0))
+    for axis, term in enumerate(((1, 0), (0, 1))):
+        for sign in (1.0, -1.0):
+            combination = np.zeros((2 * len(LINEAR), 1))
+            combination[2 * constant + axis] = 1.0
+            combination[2 * LINEAR.index(term) + axis] = sign
+            yield combination
+
+
+def one_of_each(found: Iterable[tuple[Regressors, Outcome]]) -> list[Outcome]:
+    """Outcomes with one test per question.
+
+    The p-values of single patterns are combined with that of the test of all directions.  If the
+    adjusted test is insignificant, its result is used: adjusting for other functions reduces the
+    power of a test but does not remove a real effect.
+    """
+    pairs = list(found)
+    of_all = [pair for pair in pairs if not pair[0].is_pattern]
+    out = {result.name: result for several, result in of_all if not len(several.adjusted_for)}
+    patterns: dict[str, list[float]] = {}
+    for several, result in pairs:
+        if several.is_pattern and result.name in out:
+            patterns.setdefault(result.name, []).append(result.p_value)
+    for name, p_values in patterns.items():
+        out[name] = _with_patterns(out[name], p_values)
+    for several, result in of_all:
+        if len(several.adjusted_for) and result.name in out and result.p_value > SAYS_NOTHING:
             out[result.name] = result
     return list(out.values())
+
+
+def _with_patterns(tested: Outcome, p_values: Sequence[float]) -> Outcome:
+    """Outcome of the test of all directions, combined with the p-values of single patterns.
+
+    The statistic is the one that has the combined p-value, and the smallest size that of an effect
+    in any direction.
+    """
+    n = len(p_values)
+    weights = [WEIGHT_OF_ALL, *[(1 - WEIGHT_OF_ALL) / n] * n]
+    p_value = combined_p([tested.p_value, *p_values], weights)
+    return replace(
+        tested,
+        statistic=_statistic_of(p_value, tested.dof, tested.dof_residual),
+        p_value=p_value,
+        smallest=partial(_smallest_of_any, tested),
+    )
+
+
+def _smallest_of_any(tested: Outcome, level: float) -> float:
+    """Size that the test of all directions finds alone, with its weight."""
+    return tested.smallest(WEIGHT_OF_ALL * level)
+
+
+def _statistic_of(p_value: float, dof: float, dof_residual: float | None) -> float:
+    """Statistic of `dof` directions with this p-value."""
+    p_value = max(p_value, MIN_P)
+    if dof_residual is None:
+        return float(chi2_isf(p_value, dof))
+    return float(dof * f_isf(p_value, dof, dof_residual))
