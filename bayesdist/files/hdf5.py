@@ -273,7 +273,7 @@ def read_arrays(
     return arrays
 
 
-class _Written(io.FileIO):
+class _PatientFile(io.FileIO):
     """File object for HDF5 that raises an error of the system only after HDF5 has closed its file.
 
     If an error is raised earlier, HDF5 fails again while closing and may terminate the process.
@@ -313,7 +313,7 @@ def write_arrays(path: Path, fingerprint: str, arrays: Mapping[str, NDArray[Any]
     with (
         deferred_interrupts(),
         atomic_path(path) as temporary,
-        _Written(temporary, "w+") as stream,
+        _PatientFile(temporary, "w+") as stream,
         h5py.File(stream, "w") as file,
     ):
         for name, values in arrays.items():

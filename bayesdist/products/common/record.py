@@ -34,7 +34,7 @@ class _Parameters(BaseModel):
     values: Any  # numbers, as an array or a list
 
 
-class _Chip(BaseModel):
+class _ChipRecord(BaseModel):
     number: int | None
     name: str
     size: Pair
@@ -69,7 +69,7 @@ class _Record(BaseModel):
     parameters: _Parameters
     gauge: str
     provenance: _Provenance
-    chip: _Chip
+    chip: _ChipRecord
     plane: _Plane
     errors: str = "none"
     covariance: Any = None
