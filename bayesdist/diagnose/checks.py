@@ -331,7 +331,7 @@ def exposure_checks(found: ExposureScatter | None) -> Iterator[Check]:
         shown = ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
         sentence = (
             f"{len(names)} of {len(found.names)} exposures have other errors than all together "
-            f"({shown}): give errors of each exposure, or leave out what went wrong"
+            f"({shown}): give each exposure its own errors, or leave out what went wrong"
         )
     yield Check(
         FIT,

@@ -38,7 +38,8 @@ BY_MAGNITUDE = Family(
 )
 BY_EXPOSURE = Family(
     "noise by exposure",
-    "give each exposure its own errors, or leave out exposures",
+    "give each exposure its own errors, as outliers.jitter_by = 'exposure' does for matched stars, "
+    "or leave out exposures",
     "the noise differs from exposure to exposure",
     "the noise is described equally well from exposure to exposure",
     held_by="noise",

@@ -160,6 +160,29 @@ def test_chips_have_jitters_of_their_own_on_request(tmp_path):
     assert max(abs(z) for z in covered(summary).values()) < 3
 
 
+def test_exposures_whose_noise_differs_have_jitters_of_their_own_as_advised(tmp_path):
+    """One of six has errors four times as large as quoted: the finding names what mends it."""
+    table, rng = stars(seed=7, n=2400, sizes=(QUOTED, QUOTED)), np.random.default_rng(8)
+    which = np.arange(len(table)) % 6
+    table["exposure"] = [f"e{k}" for k in which]
+    for name in ("u", "v"):
+        table[name][which == 2] += QUOTED * np.sqrt(15) * rng.standard_normal((which == 2).sum())
+    outliers = {}
+    found, flagged = [], []
+    for folder in ("one", "each"):
+        config = job(tmp_path / folder, table, holdout=None, outliers=outliers)
+        summary = summary_of(
+            partly_run(tmp_path / f"{folder}-run", config, "fit", "sample", "assess")
+        )
+        found.append([text for text in summary["warnings"] if "noise differs" in text])
+        flagged.append(summary["outliers"]["n_flagged"] / len(table))
+        outliers = {"jitter_by": "exposure"}
+    assert "outliers.jitter_by = 'exposure'" in "".join(found[0])
+    assert not found[1]
+    # 3 % are false matches, and some of those are within the errors of the others
+    assert flagged[0] > 0.08 and 0.015 < flagged[1] < 0.035
+
+
 def test_errors_far_too_small_are_scaled_first(tmp_path):
     """What is common to both axes is in the factor, what is not in the jitters."""
     table = stars(4)
