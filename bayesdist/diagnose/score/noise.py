@@ -31,7 +31,8 @@ BY_POSITION = Family(
 )
 BY_MAGNITUDE = Family(
     "noise by magnitude",
-    "give errors that depend on magnitude, or finer ones if they already do",
+    "give errors that depend on magnitude, as data.sigma = 'by_magnitude' does for matched stars, "
+    "or finer ones if they already do",
     "the noise differs from bright to faint stars",
     "the noise is described equally well from bright to faint stars",
     held_by="noise",

@@ -183,6 +183,26 @@ def test_exposures_whose_noise_differs_have_jitters_of_their_own_as_advised(tmp_
     assert flagged[0] > 0.08 and 0.015 < flagged[1] < 0.035
 
 
+def test_bright_stars_whose_noise_differs_have_errors_by_magnitude_as_advised(tmp_path):
+    """Errors of the brighter half are three times as large as quoted."""
+    table, rng = stars(seed=9, n=2400, sizes=(QUOTED, QUOTED)), np.random.default_rng(10)
+    table["mag"] = rng.uniform(12.0, 18.0, len(table))
+    bright = table["mag"] < 15.0
+    for name in ("u", "v"):
+        table[name][bright] += QUOTED * np.sqrt(8) * rng.standard_normal(bright.sum())
+    found = []
+    for sigma in ("columns", "by_magnitude"):
+        if sigma != "columns":
+            table.remove_columns(["sigma_u", "sigma_v"])
+        data = {"matches": "stars.ecsv", "sigma": sigma}
+        config = job(tmp_path / sigma, table, holdout=None, data=data)
+        run = partly_run(tmp_path / f"{sigma}-run", config, "fit", "sample", "assess")
+        warnings = summary_of(run)["warnings"]
+        found.append([text for text in warnings if "from bright to faint" in text])
+    assert "data.sigma = 'by_magnitude'" in "".join(found[0])
+    assert not found[1]
+
+
 def test_errors_far_too_small_are_scaled_first(tmp_path):
     """What is common to both axes is in the factor, what is not in the jitters."""
     table = stars(4)
