@@ -7,9 +7,9 @@ prior determines the result, as in any extrapolation.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import reduce
+from functools import partial, reduce
 from itertools import product
 
 import numpy as np
@@ -26,6 +26,7 @@ from bayesdist.diagnose.correlated.exposure_time import (
 from bayesdist.diagnose.correlated.information import Information
 from bayesdist.diagnose.correlated.priors import DiscrepancyPriors, log_half_t, log_widths
 from bayesdist.diagnose.statistics import EfficientScore
+from bayesdist.infer.equations.scaled import scaled_inverse
 from bayesdist.infer.exposures.hierarchy import MOST_OUTLYING
 from bayesdist.infer.exposures.scatter import OUTLYING, OUTLYING_FRACTION
 from bayesdist.model import DistortionModel, Groups
@@ -74,6 +75,8 @@ LEAST = 1 / 3
 MOST, MOST_RESOLVED, MOST_SUGGESTED = 100.0, 10.0, 10.0
 MOST_CURVATURE = 10.0  # in units of the median: a few dates hardly constrain the curvature
 NEGLIGIBLE = 1e-3  # density relative to the maximum
+# smallest fraction of the information on a parameter that other exposures must have
+LEAST_KEPT = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -338,8 +341,41 @@ def linear_deviations(
     efficient = EfficientScore.of(information.covariance, information.score, crossed[0], S, score)
     response = working.covariance @ crossed[1]
     return deviation_draws(
-        columns, efficient.information, efficient.score, response, priors, n, rng
+        columns,
+        efficient.information,
+        efficient.score,
+        response,
+        priors,
+        n,
+        rng,
+        change=partial(_change_without, working, columns),
     )
+
+
+def _change_without(working: Information, columns: DeviationColumns, wrong: Bool) -> Float:
+    """Change (D,) of the fit without the exposures that are True in the mask `wrong` (E,).
+
+    The step of Newton's method is that of the likelihood of the other exposures.  The fit follows
+    stars that deviate by several errors less than in proportion to their deviation, because it
+    takes them for false matches.  The curvature at the solution does not show this, but their
+    scores do.
+    """
+    D = len(working.theta)
+    score, information = np.zeros(D), np.zeros((D, D))
+    for g, cells in enumerate(working.groups()):
+        exposure = columns.of_group[g]
+        if exposure < 0 or not wrong[exposure]:
+            continue
+        score[cells.columns] += cells.onto_parameters(cells.score[..., None])[:, 0]
+        jacobian = np.einsum("ck,akm->cam", cells.phi, cells.derivative)
+        pulled = np.einsum("cab,cbm->cam", cells.curvature, jacobian)
+        information[np.ix_(cells.columns, cells.columns)] += cells.onto_parameters(pulled)
+    left = working.precision - information
+    # the frames of these exposures are no longer determined
+    kept = np.flatnonzero(np.diag(left) > LEAST_KEPT * np.diag(working.precision))
+    change = np.zeros(D)
+    change[kept] = -scaled_inverse(left[np.ix_(kept, kept)]) @ score[kept]
+    return change
 
 
 def deviation_draws(
@@ -350,12 +386,16 @@ def deviation_draws(
     priors: DiscrepancyPriors,
     n: int,
     rng: np.random.Generator,
+    *,
+    change: Callable[[Bool], Float] | None = None,
 ) -> LinearDeviations:
     """Posterior draws of deviations, with the sizes of their scatters marginalised.
 
     S (q, q) and `score` (q,) are information and score of the coefficients, with the part that the
     fit absorbs eliminated.  `taken` (D, q) is the change of the fit due to a unit of each
-    coefficient.
+    coefficient.  `change` is a function of a mask (E,) of outlying exposures that returns the
+    change (D,) of the fit without them; by default the fit follows them in proportion to their
+    deviations.
     """
     total, scatter = len(columns), columns.scatter
     medians = {
@@ -431,8 +471,14 @@ def deviation_draws(
     coefficients, amplitudes = np.concatenate(drawn)[order], np.concatenate(sizes)[order]
     of_fit = np.concatenate(followed)[order]
     per = columns.n_of_exposures // max(columns.n_exposures, 1)
-    wrong = loose[: columns.n_of_exposures].reshape(columns.n_exposures, -1).any(axis=1)
+    wrong: Bool = np.asarray(
+        loose[: columns.n_of_exposures].reshape(columns.n_exposures, -1).any(axis=1)
+    )
     correlation_time = np.concatenate(times)[order]
+    shift = np.zeros(len(taken))
+    if change is not None and wrong.any():
+        shift = change(wrong)
+        of_fit[:, : columns.n_of_exposures][:, np.repeat(wrong, per)] = 0.0
     in_time = None
     if correlation_time.any() and columns.n_exposures == columns.n_all:
         by_exposure = coefficients[:, : columns.n_of_exposures].reshape(n, columns.n_exposures, -1)
@@ -443,7 +489,7 @@ def deviation_draws(
     return LinearDeviations(
         model=columns.model,
         # the fit absorbs a deviation, so that its error has the opposite sign
-        theta=-of_fit @ taken.T,
+        theta=shift - of_fit @ taken.T,
         terms=columns.terms,
         curvature=(curvature := coefficients[:, columns.n_of_exposures :] * columns.size),
         epoch=columns.middle,

@@ -18,7 +18,7 @@ from typing import Literal
 import numpy as np
 from scipy import special
 
-from bayesdist.diagnose.statistics import holm
+from bayesdist.diagnose.statistics import combined_p, holm
 from bayesdist.utils.checks import LARGER, SCORE_TESTS
 from bayesdist.utils.distributions import chi2_isf, chi2_sf, f_isf, f_sf
 from bayesdist.utils.text import p_words
@@ -31,6 +31,8 @@ MISSING_ORDERS = "missing orders"  # name of the test for all further orders
 POWER = 0.9  # probability of detecting an effect of the stated smallest size
 # p-value below which a few of many functions are regarded as the common cause
 LEADING_CHANCE = 0.01
+# combined p-value of the shape tests below which displaced stars explain other findings
+HINT_OF_SHAPE = 0.02
 LEAST_LEFT = 0.2  # of what a few functions explain: less than that is left by their inaccuracy
 OF_FIELD = ("orders", "edges", "jumps", "rings", "repeating pattern")
 # polynomials of missing orders resemble these, and follow them in part
@@ -229,15 +231,20 @@ def _suspect(significant: Mapping[str, Family], outcomes: Sequence[Outcome]) -> 
 
     Stars that are displaced widen the residuals where they displace their mean.  A missing order
     hardly widens them, and errors of another size do not displace them, so that skewness is likely
-    if both are significant.
+    if both are significant.  A hint of it then suffices: the combined p-value of the shape tests is
+    below `HINT_OF_SHAPE`.  The family is that of the test with the smallest p-value.
     """
     if "shape" in significant or "noise by position" not in significant:
         return None
     if not {"orders", *STEEP} & set(significant):
         return None
     tests = [result for result in outcomes if result.name in (*SKEWED, "shape by position")]
-    least = min(tests, key=lambda result: result.p_value, default=None)
-    return least.family if least is not None and least.p_value < LEADING_CHANCE else None
+    if not tests:
+        return None
+    p_values = [result.p_value for result in tests]
+    if combined_p(p_values, np.full(len(tests), 1 / len(tests))) >= HINT_OF_SHAPE:
+        return None
+    return tests[int(np.argmin(p_values))].family
 
 
 def _causes(significant: Mapping[str, Family], outcomes: Sequence[Outcome]) -> dict[str, Family]:

@@ -12,7 +12,14 @@ import bayesdist as bd
 from bayesdist.diagnose.score.exposures import SECOND_ORDER
 from bayesdist.diagnose.score.noise import BY_POSITION
 from bayesdist.diagnose.score.questions import POINTING, order_family
-from bayesdist.diagnose.score.result import CAUSES, Outcome, cause_of, corrected, explains_more
+from bayesdist.diagnose.score.result import (
+    CAUSES,
+    Family,
+    Outcome,
+    cause_of,
+    corrected,
+    explains_more,
+)
 from bayesdist.diagnose.score.shape import SKEWNESS
 from bayesdist.diagnose.score.truncation import RADIUS
 from bayesdist.infer.posterior.checks import ChiSquare
@@ -60,6 +67,22 @@ def test_structure_that_widens_the_residuals_is_of_displaced_stars(p_skewness, n
     assert tests[order.name].significant and not tests[SKEWNESS.name].significant
     assert tests[order.name].remedy == (SKEWNESS if displaced else order).remedy
     assert ("the shape of the residuals" in tests[order.name].finding) == displaced
+
+
+@pytest.mark.parametrize(("p_skewness", "displaced"), [(1e-3, True), (6e-3, False)])
+def test_the_least_of_several_hints_is_no_hint_by_chance(p_skewness, displaced):
+    """Of four shape tests the least p-value is below 0.01 in four of a hundred runs."""
+    order = order_family(4, 3)
+    p_values = {order: 1e-12, BY_POSITION: 1e-12, SKEWNESS: p_skewness}
+    others = ("displaced stars", "skewness of a patch", "shape by position")
+    p_values |= {Family(name, "", "", "", group="shape"): 0.5 for name in others}
+    p_values[RADIUS_OF_MATCH] = 0.5
+    outcomes = [
+        Outcome(family, 100, 12, None, p, 0.01, lambda level: 0.01, "pix")
+        for family, p in p_values.items()
+    ]
+    tests = {test.name: test for test in corrected([*outcomes, *[outcomes[-1]] * 20])}
+    assert tests[order.name].remedy == (SKEWNESS if displaced else order).remedy
 
 
 def test_no_finding_is_its_own_cause():
