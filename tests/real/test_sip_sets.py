@@ -14,12 +14,12 @@ from bayesdist.calibration.inverse import detector_grid, fit_inverse
 from bayesdist.formats.sip.build import sip_from_solution
 from bayesdist.formats.sip.files import read_sip, sip_header, write_sip
 from bayesdist.formats.sip.header import worst_closure
-from bayesdist.formats.sip.rotate import pixel_matrix, rotated_sip
+from bayesdist.missions.wise.rotate import pixel_matrix, rotated_sip
 from bayesdist.missions.wise.simulate import wise_solution
 from tests.reduced import only_in_full
 
 from ..formats.support import StandIn, astropy_wcs, random_pixels
-from ..formats.test_sip_rotate import moved_pixels
+from ..missions.wise.test_rotate import moved_pixels
 from .sip_sets import LAST_MEASURED, SIZE, Set, curved, read_sets
 
 EXACT = 1e-9  # px
@@ -84,7 +84,7 @@ def test_written_headers_come_back_and_astropy_reads_them(sets, tmp_path, full) 
 
 
 @pytest.mark.slow
-@only_in_full("tests/formats/test_sip_rotate turns headers")
+@only_in_full("tests/missions/wise/test_rotate turns headers")
 def test_turned_headers_agree_with_astropy_at_turned_pixels(sets, full) -> None:
     """All sets, or one in twenty-five, each in one of the eight orientations; some in all."""
     x, y = random_pixels(SIZE, 50)

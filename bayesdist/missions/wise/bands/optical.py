@@ -11,9 +11,9 @@ import numpy as np
 from bayesdist.errors import InputError
 from bayesdist.formats.sip.files import read_sip
 from bayesdist.formats.sip.header import SipHeader
-from bayesdist.formats.sip.rotate import rotated_sip
 from bayesdist.missions.wise.assess.distortion_field import DistortionField
 from bayesdist.missions.wise.meta_data.meta import read_wise_meta
+from bayesdist.missions.wise.rotate import rotated_sip
 from bayesdist.model import Chip, PolynomialBasis
 from bayesdist.products.registry import open_document
 

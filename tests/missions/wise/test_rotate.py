@@ -17,10 +17,9 @@ from bayesdist.errors import InputError
 from bayesdist.formats.sip.build import sip_from_solution
 from bayesdist.formats.sip.files import read_sip, sip_header, write_sip
 from bayesdist.formats.sip.lint import lint_sip
-from bayesdist.formats.sip.rotate import coefficient_map, pixel_matrix, rotated_sip
+from bayesdist.missions.wise.rotate import coefficient_map, pixel_matrix, rotated_sip
 from bayesdist.model.basis import polynomial_terms
-
-from .support import astropy_wcs, random_pixels, some_solution
+from tests.formats.support import astropy_wcs, random_pixels, some_solution
 
 # coefficient at R = 0, and what stands there at R = 90, 180, 270
 APPENDIX_A = """
