@@ -28,7 +28,7 @@ from bayesdist.data.tables.names import find_columns
 from bayesdist.errors import InputError
 from bayesdist.files.tables import read_table
 from bayesdist.infer.solution.linear import DEFAULT_REJECTION, LinearFit, Rejection, fit_linear
-from bayesdist.missions.wise.bands.optical import optical_models
+from bayesdist.missions.wise.bands.measure import optical_models
 from bayesdist.missions.wise.pairs.read import RVB_ALIASES, band_name
 from bayesdist.missions.wise.pairs.rvb_pairs import RvbPairs, write_rvb
 from bayesdist.missions.wise.pairs.section import RadialLimit

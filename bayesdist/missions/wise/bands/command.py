@@ -27,8 +27,7 @@ from bayesdist.missions.wise.assess.residual_tables import HEADS
 from bayesdist.missions.wise.bands import figures, findings  # noqa: F401
 from bayesdist.missions.wise.bands.context import BANDS, BandResult, BandsInput
 from bayesdist.missions.wise.bands.findings import overview_table, verdict
-from bayesdist.missions.wise.bands.measure import BandRun, measure_bands, open_bands
-from bayesdist.missions.wise.bands.optical import optical_models
+from bayesdist.missions.wise.bands.measure import BandRun, measure_bands, open_bands, optical_models
 from bayesdist.missions.wise.meta_data.meta import write_wise_meta
 from bayesdist.missions.wise.published import WISE_BANDS
 from bayesdist.report.drawing import draw_all, save_drawings

@@ -1,4 +1,7 @@
-"""Analysis of each band and comparison of several bands, whose runs are opened and checked."""
+"""Measurements of each band, their comparison, and the optical models compared with them.
+
+The runs of the bands are opened and checked here.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +16,8 @@ from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.store.summary import head_of
 from bayesdist.assess import pixel_scale_of, uncertainty_map
 from bayesdist.errors import InputError
+from bayesdist.formats.sip.files import read_sip
+from bayesdist.formats.sip.header import SipHeader
 from bayesdist.missions.wise.assess.account import PRINTED_BINS, accounts, partition_parts
 from bayesdist.missions.wise.assess.distortion_field import (
     DistortionField,
@@ -22,15 +27,17 @@ from bayesdist.missions.wise.assess.distortion_field import (
 from bayesdist.missions.wise.assess.residual_field import residual_correlation, residual_partition
 from bayesdist.missions.wise.assess.residual_tables import implied_sigma, residual_tables
 from bayesdist.missions.wise.bands.context import BandResult, BandsInput, Printed
-from bayesdist.missions.wise.bands.optical import OpticalModel
+from bayesdist.missions.wise.meta_data.meta import read_wise_meta
 from bayesdist.missions.wise.published import (
     FORMAL_RADII,
     LONGEST_VECTORS,
     SAMPLE_SIZES,
     WISE_BANDS,
 )
-from bayesdist.model import Chip
+from bayesdist.missions.wise.rotate import rotated_sip
+from bayesdist.model import Chip, PolynomialBasis
 from bayesdist.model.basis import n_terms
+from bayesdist.products.registry import open_document
 
 GRID = (33, 33)
 SEED = 20110201
@@ -41,6 +48,7 @@ _OTHER_KINDS = (
     ("campaign", "campaign", "compare its filters by 'bayesdist release'"),
     ("selfcal", "self-calibration", "give runs of matched stars, one for each band"),
 )
+OTHER_FIELD = 1.5  # ratio of extents above which a header must be of another instrument
 
 
 def measure_bands(
@@ -241,3 +249,88 @@ def _require_one_field(bands: Mapping[str, BandRun]) -> None:
                     where=band.path,
                     do="compare bands with the same field of view",
                 )
+
+
+@dataclass(frozen=True, eq=False)
+class OpticalModel:
+    """Optical model of a band."""
+
+    label: str  # file name and rotation
+    sip: SipHeader  # after rotation
+
+    def field(self, chip: Chip, arcsec: float) -> DistortionField:
+        """Distortion of the model over an array with the same field of view, in its pixels.
+
+        Raises InputError if the image of the header has another aspect ratio than the array, or its
+        CD matrix implies a field of very different size.
+        """
+        size = self.sip.size or chip.size
+        times = [n_model / n for n_model, n in zip(size, chip.size, strict=True)]
+        if not np.isclose(times[0], times[1], rtol=1e-3):
+            raise InputError(
+                f"is for {size[0]:g} x {size[1]:g} pixels, but the array of {chip.name} has "
+                f"{chip.size[0]:g} x {chip.size[1]:g}",
+                where=self.label,
+                do="give a model of an array of the same shape",
+            )
+        model_arcsec = 3600 * float(np.sqrt(abs(np.linalg.det(self.sip.cd))))
+        extents = size[0] * model_arcsec, chip.size[0] * arcsec
+        if max(extents) > OTHER_FIELD * min(extents):
+            raise InputError(
+                f"covers {extents[0] / 60:.3g} arcmin by its size and CD matrix, but {chip.name} "
+                f"covers {extents[1] / 60:.3g}",
+                where=self.label,
+                do="give a model of the band's field, or correct size and CD of the header",
+            )
+        basis = PolynomialBasis(max(self.sip.order), size, self.sip.crpix)
+        monomials = np.zeros((2, basis.n_terms))
+        for axis, (terms, order) in enumerate(
+            zip((self.sip.a, self.sip.b), self.sip.order, strict=True)
+        ):
+            for (p, q), value in terms.items():
+                if p + q <= order:
+                    monomials[axis, basis.terms.index((p, q))] = value
+        # Legendre products depend only on the relative position on the array
+        polynomial = basis.from_monomials(monomials) / np.array(times)[:, None]
+        about = PolynomialBasis(basis.order, chip.size, chip.reference_pixel)
+        return DistortionField.of(about, polynomial, np.eye(2))
+
+
+def optical_models(
+    paths: Sequence[str | Path], turn: float, bands: Sequence[str]
+) -> dict[str, OpticalModel]:
+    """Optical models by band, rotated by `turn` degrees from x towards y.
+
+    `paths` is one file for all bands, or one per band.
+    """
+    if not paths:
+        return {}
+    if len(paths) not in (1, len(bands)):
+        raise InputError(
+            f"{len(paths)} optical models are given for {len(bands)} runs",
+            where="--optical",
+            do="give one for all runs, or one per run",
+        )
+    path_by_band = [*paths] * (len(bands) if len(paths) == 1 else 1)
+    out = {}
+    for band, path in zip(bands, path_by_band, strict=True):
+        label = f"{Path(path).name}, rotated by {turn:g}°" if turn % 360 else Path(path).name
+        out[band] = OpticalModel(label, rotated_sip(_sip_of(Path(path), band), turn))
+    return out
+
+
+def _sip_of(path: Path, band: str) -> SipHeader:
+    if not path.is_file():
+        raise InputError(
+            "there is no such file",
+            where=f"--optical {path}",
+            do="give a SIP header, or WISE meta-data that contain this band",
+        )
+    if open_document(path).format.key != "wise_meta":
+        return read_sip(path)
+    entries = {f"W{entry.band}": entry.sip for entry in read_wise_meta(path)}
+    if band not in entries:
+        raise InputError(
+            f"there is no band {band!r}", where=str(path), do=f"choose {', '.join(entries)}"
+        )
+    return entries[band]
