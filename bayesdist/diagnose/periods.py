@@ -18,12 +18,12 @@ from bayesdist.diagnose.residuals.misfit import STARS_PER_BIN
 from bayesdist.diagnose.residuals.tables import StatisticsTable, period_table
 from bayesdist.errors import DegenerateError
 from bayesdist.infer import LinearFit
-from bayesdist.infer.compare.period_dates import sum_by_period
 from bayesdist.infer.compare.periods import (
     PeriodComparison,
     PeriodSums,
     PositionChange,
     compare_periods,
+    sum_by_period,
     sums_of_stars,
 )
 from bayesdist.infer.stars.stars import prepare

@@ -46,7 +46,7 @@ from bayesdist.data.batches import BATCH
 from bayesdist.data.formats import mission_formats
 from bayesdist.data.tables.column import length_advice
 from bayesdist.errors import InputError
-from bayesdist.infer.compare.period_dates import check_periods, mjd_periods
+from bayesdist.infer.compare.periods import check_periods, mjd_periods
 from bayesdist.plugin import mission_objects
 
 LENGTHS = ("mm", "um")  # units that a plate scale converts to arcsec

@@ -11,10 +11,11 @@ from bayesdist.data import Matches
 from bayesdist.diagnose.periods import period_verdict
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer import Rejection, fit_linear
-from bayesdist.infer.compare.period_dates import mjd_periods, sum_by_period
 from bayesdist.infer.compare.periods import (
     PeriodComparison,
     compare_periods,
+    mjd_periods,
+    sum_by_period,
     sums_of_stars,
 )
 from bayesdist.infer.equations.scaled import chi_square
