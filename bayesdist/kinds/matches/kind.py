@@ -44,7 +44,7 @@ from bayesdist.assess.model import with_diagnosed_errors
 from bayesdist.calibration.calibration import Calibration, calibration_of
 from bayesdist.calibration.prior import CalibrationPrior, prior_of_calibration
 from bayesdist.data import Matches
-from bayesdist.diagnose.checks import frames_doubt
+from bayesdist.diagnose.checks import frames_doubt, frames_that_help
 from bayesdist.diagnose.residuals.misfit import epoch_shift, error_scale, majority_sentence
 from bayesdist.diagnose.residuals.stars import SAMPLE
 from bayesdist.errors import ConfigError, DegenerateError, InputError, NotSettledError
@@ -56,7 +56,6 @@ from bayesdist.infer import (
     load_fit,
 )
 from bayesdist.infer.catalogue.added_errors import GroupedErrors, grouped_errors
-from bayesdist.infer.exposures.frame_choice import frames_that_help
 from bayesdist.infer.solution.geometry import geometries, refuse_geometry
 from bayesdist.infer.solution.linear import Rejection
 from bayesdist.kinds.matches.config import Data, MatchesConfig

@@ -27,7 +27,7 @@ from tests.app.support import (
     write_config,
     write_job,
 )
-from tests.infer.exposures.test_frame_choice import exposures
+from tests.diagnose.test_frame_choice import exposures
 
 
 @pytest.fixture

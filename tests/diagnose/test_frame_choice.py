@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bayesdist.data import Matches
-from bayesdist.infer.exposures.frame_choice import frames_that_help
+from bayesdist.diagnose.checks import frames_that_help
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 
 SIZE, SIGMA = (1000, 800), 0.02
