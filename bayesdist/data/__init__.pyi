@@ -1,10 +1,6 @@
 """Public names and the modules that define them; each is imported on first use."""
 
-from .catalog import (
-    ReferenceCatalog as ReferenceCatalog,
-    catalog_from_table as catalog_from_table,
-    read_catalog as read_catalog,
-)
+from .catalog import ReferenceCatalog as ReferenceCatalog
 from .detections import Detections as Detections
 from .exposures import (
     Exposure as Exposure,
@@ -47,6 +43,10 @@ from .preparing import (
     with_measured_motions as with_measured_motions,
 )
 from .read import read_matches as read_matches
+from .reading.catalog import (
+    catalog_from_table as catalog_from_table,
+    read_catalog as read_catalog,
+)
 from .reading.options import ReadOptions as ReadOptions
 from .sky import (
     mean_direction as mean_direction,
