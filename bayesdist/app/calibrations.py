@@ -17,7 +17,7 @@ from bayesdist.app.store.summary import Summary
 from bayesdist.assess.comparison.compare import NOISE_SEED, Comparison, compare
 from bayesdist.calibration.calibration import Calibration, calibration_of
 from bayesdist.calibration.plane import ARCSEC, Plane
-from bayesdist.data.sky import sky_of_plane
+from bayesdist.data.tangent import sky_of_plane
 from bayesdist.errors import InputError, required
 from bayesdist.files.documents import read_json_as
 from bayesdist.infer import LinearFit, load_fit, load_posterior

@@ -11,7 +11,7 @@ from bayesdist.app.config import Config
 from bayesdist.app.kind import doubts_on_numbers
 from bayesdist.app.run import Run
 from bayesdist.data import Matches
-from bayesdist.data.sky import sky_of_plane
+from bayesdist.data.tangent import sky_of_plane
 from bayesdist.errors import InputError
 from bayesdist.model import DistortionModel, TimeDependence
 from bayesdist.model.basis import MAX_ORDER, n_terms, polynomial_terms

@@ -35,7 +35,7 @@ from bayesdist.assess.terms.parameters import (
 from bayesdist.calibration.calibration import Calibration, GaussianSolution, calibration_of
 from bayesdist.calibration.chip_map import FurtherError
 from bayesdist.calibration.plane import ARCSEC, Plane
-from bayesdist.data.sky import sky_of_plane
+from bayesdist.data.tangent import sky_of_plane
 from bayesdist.diagnose.residuals.stars import StarSample, star_sample
 from bayesdist.errors import InputError
 from bayesdist.files.atomic import atomic_path, path_within

@@ -6,12 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesdist.data.sky import (
-    is_on_plane,
-    sky_of_plane,
-    tangent_jacobian,
-    tangent_plane,
-)
+from bayesdist.data.tangent import is_on_plane, sky_of_plane, tangent_jacobian, tangent_plane
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.utils.arrays import Float
 

@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.chip_map import ChipMap, FurtherError, chosen_chip
 from bayesdist.calibration.plane import ARCSEC, SkyPlacement
-from bayesdist.data.sky import plane_axes
+from bayesdist.data.tangent import plane_axes
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.quantities import (

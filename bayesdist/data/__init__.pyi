@@ -48,15 +48,15 @@ from .reading.catalog import (
     read_catalog as read_catalog,
 )
 from .reading.options import ReadOptions as ReadOptions
-from .sky import (
-    mean_direction as mean_direction,
-    tangent_plane as tangent_plane,
-    velocity_aberration as velocity_aberration,
-)
+from .sky import velocity_aberration as velocity_aberration
 from .starlists import (
     StarCuts as StarCuts,
     read_star_lists as read_star_lists,
 )
 from .storage import open_matches as open_matches
 from .tables.column import UNITS as UNITS
+from .tangent import (
+    mean_direction as mean_direction,
+    tangent_plane as tangent_plane,
+)
 from .writing import write_partitioned as write_partitioned

@@ -32,10 +32,10 @@ from bayesdist.data.reading.table import (
     sky_positions,
 )
 from bayesdist.data.repeated import star_codes
-from bayesdist.data.sky import mean_direction
 from bayesdist.data.tables.checks import absent
 from bayesdist.data.tables.column import SourceColumn
 from bayesdist.data.tables.names import ALIASES, find_columns
+from bayesdist.data.tangent import mean_direction
 from bayesdist.errors import InputError, required
 from bayesdist.files.tables import read_table
 

@@ -52,17 +52,12 @@ from bayesdist.data.reading.motions import (
 )
 from bayesdist.data.reading.options import ReadArguments, ReadOptions, refuse_missing_errors
 from bayesdist.data.repeated import buckets_for, first_repetition
-from bayesdist.data.sky import (
-    MOTIONS,
-    direction_of,
-    direction_sum,
-    sky_columns,
-    states_correlations,
-)
+from bayesdist.data.sky import MOTIONS, sky_columns, states_correlations
 from bayesdist.data.tables.checks import refuse_half
 from bayesdist.data.tables.column import Quantities, SourceColumn
 from bayesdist.data.tables.names import ASSUMED
 from bayesdist.data.tables.parquet import ParquetPart, RowBlock, describe_part
+from bayesdist.data.tangent import direction_of, direction_sum
 from bayesdist.errors import FormatError, InputError
 from bayesdist.utils.arrays import Float
 

@@ -14,7 +14,7 @@ from bayesdist.calibration.calibration import Calibration, calibration_of_maps
 from bayesdist.calibration.chip_map import ChipMap, fitted_map
 from bayesdist.calibration.inverse import detector_grid
 from bayesdist.calibration.plane import Plane
-from bayesdist.data.sky import is_on_plane, separation, sky_of_plane, tangent_plane
+from bayesdist.data.tangent import is_on_plane, separation, sky_of_plane, tangent_plane
 from bayesdist.errors import InputError
 from bayesdist.products.common.cards import holds_wcs
 from bayesdist.products.common.celestial import image_size, projection_code, wcs_of

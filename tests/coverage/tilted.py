@@ -27,7 +27,8 @@ from typing import Any
 import numpy as np
 
 import bayesdist as bd
-from bayesdist.data.sky import mean_direction, parallax_factors, sky_of_plane
+from bayesdist.data.sky import parallax_factors
+from bayesdist.data.tangent import mean_direction, sky_of_plane
 from bayesdist.model.grid import grid_pixels, mesh
 from tests.adversarial.fields import MIDDLE, SIDE, distortion
 from tests.coverage.places import LIMITS

@@ -6,7 +6,7 @@ from astropy.coordinates import SkyCoord
 from astropy.wcs import WCS
 
 from bayesdist.data import mean_direction, tangent_plane
-from bayesdist.data.sky import sky_of_plane, tangent_jacobian
+from bayesdist.data.tangent import sky_of_plane, tangent_jacobian
 from bayesdist.errors import InputError
 
 

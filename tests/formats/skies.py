@@ -10,7 +10,7 @@ from astropy.io import fits
 from astropy.wcs import WCS
 
 from bayesdist.calibration.calibration import Calibration
-from bayesdist.data.sky import sky_of_plane
+from bayesdist.data.tangent import sky_of_plane
 
 __all__ = ["PROGRAMS", "apart_mas", "sky_by", "sky_of"]
 

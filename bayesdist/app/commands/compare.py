@@ -41,7 +41,7 @@ from bayesdist.assess.comparison.frame import (
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.inverse import detector_grid
 from bayesdist.calibration.plane import ARCSEC
-from bayesdist.data.sky import separation
+from bayesdist.data.tangent import separation
 from bayesdist.errors import InputError
 from bayesdist.model.grid import DEFAULT_GRID
 from bayesdist.products.common.document import MissingSizeError

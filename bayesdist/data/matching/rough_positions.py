@@ -22,18 +22,11 @@ from bayesdist.data.reading.columns import CENTROIDS
 from bayesdist.data.reading.motions import NEEDED, with_prior_motions
 from bayesdist.data.reading.options import ReadOptions
 from bayesdist.data.reading.table import SKY_COLUMN, as_table, icrs_of, own_epoch, with_sky_columns
-from bayesdist.data.sky import (
-    MOTIONS,
-    PARAMETERS,
-    SKY_QUANTITIES,
-    reference_sky,
-    sky_columns,
-    sky_of_plane,
-    tangent_jacobian,
-)
+from bayesdist.data.sky import MOTIONS, PARAMETERS, SKY_QUANTITIES, reference_sky, sky_columns
 from bayesdist.data.tables.checks import without_missing
 from bayesdist.data.tables.column import Quantities
 from bayesdist.data.tables.names import ALIASES, ASSUMED, PAIRS, find_columns, origin_of
+from bayesdist.data.tangent import sky_of_plane, tangent_jacobian
 from bayesdist.errors import InputError
 from bayesdist.files.tables import read_table
 from bayesdist.utils.arrays import Float, Int

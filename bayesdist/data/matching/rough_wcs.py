@@ -44,9 +44,9 @@ from bayesdist.data.matching.similarity import brightest, find_similarity, grown
 from bayesdist.data.reading.columns import CENTROIDS, present_columns
 from bayesdist.data.reading.options import ReadOptions
 from bayesdist.data.reading.table import match_arguments
-from bayesdist.data.sky import mean_direction, separation, tangent_plane
 from bayesdist.data.tables.column import Quantities, unit_of
 from bayesdist.data.tables.names import ALIASES
+from bayesdist.data.tangent import mean_direction, separation, tangent_plane
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.quantities import Direction, Epoch, Number, value_in

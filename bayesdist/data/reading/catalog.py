@@ -15,17 +15,11 @@ from bayesdist.data.covariances import with_correlations
 from bayesdist.data.reading.columns import is_on_sky, plane_unit, position_unit
 from bayesdist.data.reading.motions import prior_in_mas, with_prior_motions
 from bayesdist.data.reading.table import as_table, with_sky_columns
-from bayesdist.data.sky import (
-    CORRELATIONS,
-    PARAMETERS,
-    correlation_matrices,
-    onto_plane,
-    sky_columns,
-    tangent_jacobian,
-)
+from bayesdist.data.sky import CORRELATIONS, PARAMETERS, correlation_matrices, sky_columns
 from bayesdist.data.tables.checks import refuse_half, row_number, without_missing
 from bayesdist.data.tables.column import Quantities, SourceColumn
 from bayesdist.data.tables.names import ALIASES, find_columns
+from bayesdist.data.tangent import onto_plane, tangent_jacobian
 from bayesdist.errors import InputError
 from bayesdist.files.fits import MISSING_EXTENSIONS
 from bayesdist.files.tables import read_table

@@ -13,10 +13,11 @@ from bayesdist.data.covariances import LARGEST_RHO
 from bayesdist.data.reading.centroids import with_centroid_errors
 from bayesdist.data.reading.motions import refuse_unused_prior
 from bayesdist.data.reading.options import ReadOptions
-from bayesdist.data.sky import SKY_QUANTITIES, onto_plane, reference_sky
+from bayesdist.data.sky import SKY_QUANTITIES, reference_sky
 from bayesdist.data.tables.checks import refuse_half
 from bayesdist.data.tables.column import EncodedColumn, Quantities, SourceColumn, check_unit
 from bayesdist.data.tables.names import ALIASES, ASSUMED, PAIRS, find_columns, origin_of
+from bayesdist.data.tangent import onto_plane
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Float, Int
 

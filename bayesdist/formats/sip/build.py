@@ -23,8 +23,8 @@ from bayesdist.calibration.chip_map import ChipMap, Monomials
 from bayesdist.calibration.inverse import detector_grid, fit_inverse
 from bayesdist.calibration.orientation import MAX_DEPARTURE, departure_from_tangent_plane
 from bayesdist.calibration.plane import ARCSEC, arcsec_per
-from bayesdist.data.sky import ARCSEC as ARCSEC_PER_RADIAN
-from bayesdist.data.sky import plane_axes, sky_of_plane, tangent_plane
+from bayesdist.data.tangent import ARCSEC as ARCSEC_PER_RADIAN
+from bayesdist.data.tangent import plane_axes, sky_of_plane, tangent_plane
 from bayesdist.errors import InputError
 from bayesdist.formats.sip.files import sip_header
 from bayesdist.formats.sip.header import (

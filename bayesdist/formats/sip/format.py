@@ -16,7 +16,7 @@ from bayesdist.calibration.chip_map import fitted_map, refuse_order
 from bayesdist.calibration.inverse import detector_grid
 from bayesdist.calibration.orientation import MAX_DEPARTURE, departure_from_tangent_plane
 from bayesdist.calibration.plane import ARCSEC, Plane, arcsec_per
-from bayesdist.data.sky import sky_of_plane, tangent_plane
+from bayesdist.data.tangent import sky_of_plane, tangent_plane
 from bayesdist.formats.sip.build import sip_from_solution, sip_wcs
 from bayesdist.formats.sip.files import holds_sip, parsed, sip_header, sip_of, sip_text
 from bayesdist.formats.sip.header import (

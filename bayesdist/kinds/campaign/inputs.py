@@ -27,7 +27,8 @@ from bayesdist.data import (
 from bayesdist.data.covariances import without_sizes
 from bayesdist.data.matching.reports import check_campaign
 from bayesdist.data.preparing import refuse_strangers
-from bayesdist.data.sky import mean_direction, parallax_factors, tangent_plane
+from bayesdist.data.sky import parallax_factors
+from bayesdist.data.tangent import mean_direction, tangent_plane
 from bayesdist.errors import ConfigError, DegenerateError, InputError
 from bayesdist.files.tables import read_table
 from bayesdist.infer.catalogue.star_errors import StarErrors

@@ -19,8 +19,8 @@ from bayesdist.calibration.plane import ARCSEC
 from bayesdist.data import Matches, input_files, open_matches, read_matches
 from bayesdist.data.batches import BATCH
 from bayesdist.data.reading.options import ReadArguments
-from bayesdist.data.sky import separation, sky_of_plane
 from bayesdist.data.tables.parquet import describe_part
+from bayesdist.data.tangent import separation, sky_of_plane
 from bayesdist.errors import InputError
 from bayesdist.kinds.matches.config import Data
 from bayesdist.plugin import mission_objects

@@ -18,7 +18,7 @@ import numpy as np
 from astropy.io import fits
 
 from bayesdist.calibration.inverse import detector_grid
-from bayesdist.data.sky import plane_axes, separation, sky_of_plane
+from bayesdist.data.tangent import plane_axes, separation, sky_of_plane
 from bayesdist.errors import FormatError, InputError
 from bayesdist.files.faults import reason_of
 from bayesdist.model.basis import MAX_ORDER

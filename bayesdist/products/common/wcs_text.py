@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from astropy.io import fits
 
-from bayesdist.data.sky import tangent_plane
+from bayesdist.data.tangent import tangent_plane
 from bayesdist.errors import InputError
 from bayesdist.files.fits import RECORD
 from bayesdist.products.common.cards import holds_wcs

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from bayesdist.calibration.calibration import Calibration, calibration_of
-from bayesdist.data.sky import mean_direction, tangent_plane
+from bayesdist.data.tangent import mean_direction, tangent_plane
 from bayesdist.diagnose.overlap import ExposureAlignment, align
 from bayesdist.missions.hst.release import Period, write_release
 from bayesdist.missions.hst.simulate.making import detector_tables, filter_tables

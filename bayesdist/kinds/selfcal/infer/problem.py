@@ -16,7 +16,7 @@ import numpy as np
 from scipy import ndimage
 
 from bayesdist.data.detections import Detections
-from bayesdist.data.sky import ARCSEC
+from bayesdist.data.tangent import ARCSEC
 from bayesdist.errors import InputError
 from bayesdist.infer import kernel
 from bayesdist.infer.kernel.blocks import threads_for
