@@ -29,6 +29,7 @@ from bayesdist.utils.distributions import chi2_sf
 COLUMNS = ["name", "state", "sigma_detections", "sigma_fixed", "unit", "edge_pix", "fixed_by"]
 
 CONVENTION, DETECTIONS, REFERENCES = "convention", "detections", "reference stars"
+TOGETHER = "all together"
 
 _COLUMNS = {
     "exposure": ("exposure", "name", "rootname"),
@@ -45,19 +46,32 @@ _LARGEST = {"du": 1e8, "dv": 1e8, "sigma": 1e8, "roll": 720.0}
 def fixed_by(
     gauge: Gauge, solution: SelfCalibrationMode, pieces: GaugeConstraints
 ) -> dict[str, str]:
-    """Source of the constraint on each property of the solution, by name of the property."""
+    """Source of the constraint on each property and common motion of the sky, by its name."""
     problem, theta = solution.problem, solution.theta
     alone, with_priors = solution.curvatures
     priors = {name: piece(theta) for name, piece in pieces.pieces.items()}
     sigmas: dict[str, dict[str, float]] = {}
+    relative: dict[str, tuple[str, ...]] = {}  # common motions that each source leaves free
     none = Prior.none(theta)
     for name, information in priors.items():
         constrained = find_gauge(problem, theta, alone, information)
         sigmas[name] = {d.name: d.sigma_fixed for d in constrained.directions}
+        relative[name] = constrained.relative
     if problem.priors.informed.any():
         constrained = find_gauge(problem, theta, alone, none, known=with_priors)
         sigmas[REFERENCES] = {d.name: d.sigma_fixed for d in constrained.directions}
-    return {d.name: _fixed_by(d, sigmas) for d in gauge.directions}
+        relative[REFERENCES] = constrained.relative
+    motions = {}
+    for motion in gauge.motions:
+        sources = [source for source, left in relative.items() if motion.name not in left]
+        motions[motion.name] = (
+            CONVENTION
+            if motion.held
+            else " and ".join(sources) or TOGETHER
+            if motion.determined
+            else DETECTIONS
+        )
+    return {d.name: _fixed_by(d, sigmas) for d in gauge.directions} | motions
 
 
 def _fixed_by(direction: NamedDirection, sigmas: Mapping[str, Mapping[str, float]]) -> str:
@@ -67,7 +81,7 @@ def _fixed_by(direction: NamedDirection, sigmas: Mapping[str, Mapping[str, float
     sources = [name for name, of in sigmas.items() if of[direction.name] < limit]
     if direction.by_detections:
         return DETECTIONS
-    return " and ".join(sources) or "all together"
+    return " and ".join(sources) or TOGETHER
 
 
 def gauge_table(gauge: Gauge, fixed: Mapping[str, str], model: DistortionModel) -> Table:
@@ -77,6 +91,10 @@ def gauge_table(gauge: Gauge, fixed: Mapping[str, str], model: DistortionModel) 
         for d in sorted(gauge.directions, key=lambda d: (not d.free, not d.weak))
     ]
     blank = {"sigma_fixed": np.nan, "unit": "", "edge_pix": np.nan, "fixed_by": ""}
+    for motion in gauge.motions:
+        state, sigma = ("free", np.inf) if motion.free else ("nearly free", np.nan)
+        row = {"name": motion.name, "state": state, "sigma_detections": sigma}
+        rows.append(blank | row | {"fixed_by": fixed[motion.name]})
     for sigma, k in gauge.weakest:
         row = {"name": f"combination led by {model.names[int(k)]}", "state": "nearly free"}
         at_edge = {"sigma_detections": sigma, "unit": "pix at the edge", "edge_pix": 1.0}
@@ -128,6 +146,8 @@ def gauge_words(
     for d in gauge.directions:
         if d.free or d.weak:
             by.setdefault(fixed[d.name], []).append(d.name.replace("_", " "))
+    for motion in gauge.motions:
+        by.setdefault(fixed[motion.name], []).append(motion.name.replace("_", " "))
     parts = [f"{', '.join(names)} by {source}" for source, names in by.items()]
     held = ", ".join(model.names[k] for k in gauge.held)
     text = "Gauge of a self-calibration: " + ("; ".join(parts) or "all is known from detections")

@@ -349,6 +349,8 @@ def selfcal_lines(inputs: SelfcalInputs) -> Iterator[str]:
     for direction in gauge.directions:
         if direction.free or direction.weak:
             yield f"             {_state_words(direction, fixed[direction.name])}"
+    for motion in gauge.motions:
+        yield f"             {motion.name} of the whole sky: {_held_words(fixed[motion.name])}"
     for sigma, k in gauge.weakest:
         yield f"nearly free  {number(sigma)} pix at the edge, led by {model.names[int(k)]}"
     doubtful = [text for chip in chips for text in chip.warnings]
@@ -361,9 +363,13 @@ def selfcal_lines(inputs: SelfcalInputs) -> Iterator[str]:
 def _state_words(one: NamedDirection, by: str) -> str:
     """Text with the error of a direction from the detections, its constraint and final error."""
     uncertainty = "" if one.free else f", {number(one.sigma)} {one.unit} from detections".rstrip()
-    how = "held by convention" if by == CONVENTION else f"fixed by {by}"
     size = "" if by == CONVENTION else f", sigma {number(one.sigma_fixed)} {one.unit}".rstrip()
-    return f"{one.name}{uncertainty}: {how}{size}"
+    return f"{one.name}{uncertainty}: {_held_words(by)}{size}"
+
+
+def _held_words(by: str) -> str:
+    """Clause on the source `by` that determines a direction."""
+    return "held by convention" if by == CONVENTION else f"fixed by {by}"
 
 
 def matches_of(

@@ -84,6 +84,20 @@ class NamedDirection:
         return bool(finite and self.sigma < FAR * self.sigma_fixed)
 
 
+@dataclass(frozen=True)
+class CommonMotion:
+    """Move of the entire sky with time that the detections do not determine, or hardly."""
+
+    name: str  # from `RATES`, or `PARALLAX`
+    free: bool  # True if the detections do not determine it at all
+    determined: bool  # True if information from other sources determines it
+
+    @property
+    def held(self) -> bool:
+        """True if the motion is fixed by convention."""
+        return self.free and not self.determined
+
+
 @dataclass(frozen=True, eq=False)
 class Decision:
     """Number of free directions and the parameters fixed by convention, stored with a solution.
@@ -120,9 +134,9 @@ class Gauge:
         Largest difference of two roll angles in radians, modulo half a turn.
     whole : tuple of str
         Linear maps of the entire sky that are free, from `GENERATORS`.
-    rates : tuple of str
-        Moves of the entire sky with time that are free if stars have proper motions, from `RATES`
-        and `PARALLAX`.
+    motions : tuple of CommonMotion
+        Moves of the entire sky with time that the detections do not determine, or hardly, if stars
+        have proper motions.
     """
 
     null: Float
@@ -133,7 +147,12 @@ class Gauge:
     weakest: Float
     spread: float
     whole: tuple[str, ...] = ()
-    rates: tuple[str, ...] = ()
+    motions: tuple[CommonMotion, ...] = ()
+
+    @property
+    def relative(self) -> tuple[str, ...]:
+        """Names of the common motions that no information determines."""
+        return tuple(motion.name for motion in self.motions if not motion.determined)
 
     @property
     def decision(self) -> Decision:
@@ -208,10 +227,16 @@ class Gauge:
                 else "the zero point on the sky is free: only relative positions are known"
             )
             out.append((text, True))
-        if self.rates:
+        if self.relative:
             text = (
-                f"motions are relative: {', '.join(self.rates)} of the whole sky cannot be told "
+                f"motions are relative: {', '.join(self.relative)} of the whole sky cannot be told "
                 "from what the exposures did"
+            )
+            out.append((text, True))
+        if others := [motion.name for motion in self.motions if motion.determined]:
+            text = (
+                f"{', '.join(others)} of the whole sky: not determined by the detections; the "
+                f"constraints that are given determine {'it' if len(others) == 1 else 'them'}"
             )
             out.append((text, True))
         if self.unnamed:
@@ -268,10 +293,20 @@ def find_gauge(
         [row / scale for row in (named | moving).values()], axis=1
     )
     # compare with nearly free directions too, since a spin slightly bends the paths of moving stars
-    loose = alone.vectors[:, alone.values < WEAK_PIX**-2]
-    weak = np.flatnonzero(alone.values[alone.n :] < WEAK_PIX**-2) + alone.n
+    loose, still_loose = (s.vectors[:, s.values < WEAK_PIX**-2] for s in (alone, fixed))
+    whole = tuple(name for name in GENERATORS if _within(named[name] / scale, null))
+    # the epoch at which the sky has not moved yet is arbitrary, which adds moves without time
+    at_rest = [named[name] / scale for name in (*POINTS, *whole)]
+    motions = []
+    for name, row in moving.items():
+        free = _within(row / scale, null)
+        if free or _within(row / scale, loose):
+            undetermined = np.column_stack([open_ if free else still_loose, *at_rest])
+            space, _ = np.linalg.qr(undetermined)
+            motions.append(CommonMotion(name, free, not _within(row / scale, space)))
+    nearly_free = np.flatnonzero(alone.values[alone.n :] < WEAK_PIX**-2) + alone.n
     weakest = np.array(
-        [[alone.values[k] ** -0.5, np.argmax(np.abs(alone.vectors[:, k]))] for k in weak]
+        [[alone.values[k] ** -0.5, np.argmax(np.abs(alone.vectors[:, k]))] for k in nearly_free]
     ).reshape(-1, 2)
     return Gauge(
         null=null * scale[:, None],
@@ -281,8 +316,8 @@ def find_gauge(
         unnamed=_unnamed(model, null, known_moves),
         weakest=weakest,
         spread=largest_roll_difference(model, theta),
-        whole=tuple(name for name in GENERATORS if _within(named[name] / scale, null)),
-        rates=tuple(name for name, row in moving.items() if _within(row / scale, loose)),
+        whole=whole,
+        motions=tuple(motions),
     )
 
 

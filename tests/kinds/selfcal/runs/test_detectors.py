@@ -7,14 +7,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from astropy import units as u
 from astropy.table import Table
 from astropy.wcs import WCS
 from scipy import stats
 
+from bayesdist.app.cli import main
 from bayesdist.app.store.record import write_table
 from bayesdist.data.sky import parallax_factors
 from bayesdist.infer import load_fit
-from bayesdist.kinds.selfcal.fit import star_table
+from bayesdist.kinds.selfcal.fit import SelfCalibrated, star_table
 from bayesdist.kinds.selfcal.infer import star_catalogue
 from bayesdist.kinds.selfcal.infer.gauge import functionals
 from bayesdist.kinds.selfcal.patterns.exposures import pixels_of
@@ -136,9 +138,10 @@ def test_motions_of_stars_that_do_not_move(tmp_path):
     run = fitted(tmp_path / "run", config)
     stars = star_catalogue(run.parts["solved"].mode)
     assert stars.values.shape[1] == 4 and stars.epoch == pytest.approx(EPOCHS.mean())
-    assert run.parts["solved"].gauge.rates == ("drift_u", "drift_v", "spin")
+    assert run.parts["solved"].gauge.relative == ("drift_u", "drift_v", "spin")
     assert not run.parts["solved"].gauge.unnamed
     assert "motions are relative" in " ".join(run.parts["solved"].gauge.sentences)
+    assert "drift u, drift v, spin by convention" in run.gauge_words
     place, motion = (stars.values[:, k : k + 2] @ [1, 1j] for k in (0, 2))
     sigma = np.sqrt(np.einsum("naa->n", stars.own[:, 2:, 2:]) / 2)
     design = np.column_stack([np.ones(len(stars)), 1j * place]) / sigma[:, None]
@@ -151,6 +154,50 @@ def test_motions_of_stars_that_do_not_move(tmp_path):
     # the distortion's errors come on top of the stars' own
     assert inside > 0.93 - 3 * np.sqrt(0.95 * 0.05 / len(pulls))
     assert "pm_u" in Table.read(_stars(run)).colnames
+
+
+def test_motions_of_references_fix_those_of_the_whole_sky(tmp_path, capsys):
+    """With them, motions are those of the reference frame, and 'check' lists what fixes each.
+
+    Stars that do not move have motions of zero in that frame.
+    """
+    truth = small()
+    config = write_selfcal(
+        tmp_path / "input",
+        list_table(truth),
+        selfcal={"exposures": "log.ecsv", "motion": "proper_motion", "min_detections": 4}
+        | {"unit": "mas"},
+        gauge={"reference": {"catalog": "reference.ecsv", "tangent_point": [RA, DEC]}},
+    )
+    _log(truth, config.parent, np.ones(8))
+    rng = np.random.default_rng(8)
+    known = rng.choice(len(truth.sky), 200, replace=False)
+    table = _on_the_sky(truth.sky[known] - truth.sky.mean(axis=0))
+    error = 0.01  # mas / yr
+    for name in ("pmra", "pmdec"):
+        table[name] = rng.normal(0, error, len(table)) * u.mas / u.yr
+        table[f"{name}_error"] = np.full(len(table), error) * u.mas / u.yr
+    table["epoch"] = np.full(len(table), EPOCHS.mean())
+    table.write(config.parent / "reference.ecsv")
+    assert main(["check", str(config)]) == 0
+    told = " ".join(capsys.readouterr().out.split())
+    rates = ("drift_u", "drift_v", "spin")
+    listed = ("zero_point_u", "zero_point_v", "scale", "rotation")
+    assert "7 directions are free, 0 of them held by convention" in told
+    for name in (*listed, *(f"{rate} of the whole sky" for rate in rates)):
+        assert f"{name}: fixed by reference stars" in told
+    assert "motions are relative" not in told
+    run = fitted(tmp_path / "run", config)
+    gauge = run.part(SelfCalibrated).gauge
+    assert tuple(motion.name for motion in gauge.motions) == rates and not gauge.relative
+    assert "drift u, drift v, spin by reference stars" in run.gauge_words
+    rows = {str(row["name"]): str(row["fixed_by"]) for row in run.part(SelfCalibrated).gauge_table}
+    assert rows["spin"] == "reference stars"
+    stars = star_catalogue(run.part(SelfCalibrated).mode)
+    weight = 1 / stars.own[:, 2, 2]
+    mean = np.average(stars.values[:, 2], weights=weight)
+    # the mean of the stars' motions, by its error
+    assert abs(mean) < 4 * np.hypot(weight.sum() ** -0.5, error / np.sqrt(200))
 
 
 def test_parallaxes(tmp_path):
@@ -181,7 +228,7 @@ def test_parallaxes(tmp_path):
     known = rng.choice(len(truth.sky), 200, replace=False)
     _on_the_sky(truth.sky[known] - truth.sky.mean(axis=0)).write(config.parent / "reference.ecsv")
     run = fitted(tmp_path / "run", config)
-    assert "parallax" in run.parts["solved"].gauge.rates
+    assert "parallax" in run.parts["solved"].gauge.relative
     assert "parallax of the whole sky" in " ".join(run.parts["solved"].gauge.sentences)
     problem, stars = (
         run.parts["solved"].mode.problem,
