@@ -6,13 +6,15 @@ import inspect
 import re
 import sys
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
 import pytest
+from numba.core.event import Event, Listener, install_listener
 
 import bayesdist
 from tests.kinds.selfcal.runs.support import list_table, small, write_selfcal
@@ -47,12 +49,10 @@ def is_upward(caller: str, callee: str, packages: dict[str, dict[str, int]]) -> 
     return False
 
 
-def file_of(frame: FrameType) -> str | None:
-    """File of the package in which a function is, relative to the repository; None if elsewhere."""
-    path = frame.f_code.co_filename
-    if frame.f_code.co_name == "<module>" or not path.startswith(f"{PACKAGE}/"):
-        return None
-    return f"bayesdist/{path[len(str(PACKAGE)) + 1 :]}"
+@cache
+def file_of(path: str) -> str | None:
+    """File of the package, relative to the repository; None if it is elsewhere."""
+    return f"bayesdist{path[len(str(PACKAGE)) :]}" if path.startswith(f"{PACKAGE}/") else None
 
 
 @contextmanager
@@ -64,11 +64,16 @@ def calls_traced() -> Iterator[Calls]:
     found: Calls = set()
 
     def called(frame: FrameType, event: str, _: Any) -> None:
-        if event != "call" or frame.f_code.co_flags & inspect.CO_GENERATOR:
+        if event != "call":
             return
-        callee, caller = file_of(frame), frame.f_back
-        while callee and caller and "importlib" not in caller.f_code.co_filename:
-            if place := file_of(caller):
+        code = frame.f_code
+        callee = file_of(code.co_filename)
+        if not callee or code.co_name == "<module>" or code.co_flags & inspect.CO_GENERATOR:
+            return
+        caller = frame.f_back
+        while caller and "importlib" not in caller.f_code.co_filename:
+            place = file_of(caller.f_code.co_filename)
+            if place and caller.f_code.co_name != "<module>":
                 found.add((place, callee))
                 return
             caller = caller.f_back
@@ -76,9 +81,27 @@ def calls_traced() -> Iterator[Calls]:
     before = sys.getprofile()
     sys.setprofile(called)
     try:
-        yield found
+        with install_listener("numba:compiler_lock", Untraced(called)):
+            yield found
     finally:
         sys.setprofile(before)
+
+
+class Untraced(Listener):
+    """Compilation, which takes a minute while each of its calls is looked at, is not traced."""
+
+    def __init__(self, trace: Callable[[FrameType, str, Any], None]):
+        self.trace = trace
+        self.depth = 0  # compiled functions call others, which are compiled meanwhile
+
+    def on_start(self, event: Event) -> None:
+        self.depth += 1
+        sys.setprofile(None)
+
+    def on_end(self, event: Event) -> None:
+        self.depth -= 1
+        if not self.depth:
+            sys.setprofile(self.trace)
 
 
 def declared() -> list[tuple[str, str]]:
