@@ -113,7 +113,7 @@ class ClusterPieces(MappedPieces[Piece_co]):
             # sources stay in files or in the scheduler, so that a lost piece can be made again
             with _large_graphs():
                 for k, source in enumerate(sources):
-                    record = source if folder is None else _RecordFile.as_number(k, source, folder)
+                    record = source if folder is None else _PieceFile.as_number(k, source, folder)
                     with self._connection():
                         self._pieces.append(
                             self._client.submit(
@@ -343,13 +343,13 @@ class _Work:
 
 
 @dataclass(frozen=True)
-class _RecordFile:
+class _PieceFile:
     """Path of a record that the workers read."""
 
     path: Path
 
     @classmethod
-    def as_number(cls, k: int, record: Any, folder: Path) -> _RecordFile:
+    def as_number(cls, k: int, record: Any, folder: Path) -> _PieceFile:
         """Write a record to a folder under the number `k`."""
         path = folder / f"{k:06d}.h5"
         write_record(path, record)
@@ -369,7 +369,7 @@ class _RecordFile:
 
 def _made_from(make: Callable[[Any], T], source: Any) -> T:
     """Make a piece from a source, which may be in a file (runs on a worker)."""
-    return make(source.read() if isinstance(source, _RecordFile) else source)
+    return make(source.read() if isinstance(source, _PieceFile) else source)
 
 
 def _made(_: Any) -> None:
