@@ -30,7 +30,7 @@ from bayesdist.assess.units import pixel_scale_of
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.errors import InputError, required
 from bayesdist.infer import LinearFit, Posterior
-from bayesdist.infer.catalogue.star_errors import StarCovariance
+from bayesdist.infer.catalogue.star_covariance import StarCovariance
 from bayesdist.infer.equations.scaled import one_thread, recolouring, scaled_cholesky
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.model import LookupTable

@@ -53,7 +53,8 @@ from bayesdist.diagnose.score.result import ScoreTest
 from bayesdist.diagnose.score.tests import score_tests
 from bayesdist.errors import InputError
 from bayesdist.infer import Compute, GaussianPriors, LinearFit, Posterior, Shards, fit_linear
-from bayesdist.infer.catalogue.star_errors import StarCovariance, StarErrors, star_covariance
+from bayesdist.infer.catalogue.star_covariance import StarCovariance, star_covariance
+from bayesdist.infer.catalogue.star_errors import StarErrors
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.exposures.hierarchy import Settling
 from bayesdist.infer.posterior.checks import ChiSquare

@@ -1,11 +1,11 @@
 """Public names and the modules that define them; each is imported on first use."""
 
 from .catalogue.magnitude_errors import fit_by_magnitude as fit_by_magnitude
-from .catalogue.star_errors import (
+from .catalogue.star_covariance import (
     StarCovariance as StarCovariance,
-    StarErrors as StarErrors,
     star_covariance as star_covariance,
 )
+from .catalogue.star_errors import StarErrors as StarErrors
 from .convergence import (
     Convergence as Convergence,
     Limits as Limits,

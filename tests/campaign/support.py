@@ -16,7 +16,8 @@ from bayesdist.app.config import load_config
 from bayesdist.app.run import Run
 from bayesdist.app.stages import make_stages
 from bayesdist.app.store.rundir import RunDirectory
-from bayesdist.infer.catalogue.star_errors import StarErrors, star_covariance
+from bayesdist.infer.catalogue.star_covariance import star_covariance
+from bayesdist.infer.catalogue.star_errors import StarErrors
 from bayesdist.infer.exposures.hierarchy import HierarchicalFit
 from bayesdist.infer.nodes import Matern, NodeGrid, TableFit
 from bayesdist.infer.solution.solution import TransformedSolution

@@ -15,7 +15,8 @@ from bayesdist.data.preparing import HoldoutSpec, HoldoutSplit, split_matches
 from bayesdist.diagnose.holdout.predictive import ExposureDeviations, Predictive
 from bayesdist.diagnose.holdout.validation import HoldoutValidation, holdout_validation
 from bayesdist.infer import OutlierMixture, Rejection, load
-from bayesdist.infer.catalogue.star_errors import StarErrors, star_covariance, star_influence
+from bayesdist.infer.catalogue.star_covariance import star_covariance, star_influence
+from bayesdist.infer.catalogue.star_errors import StarErrors
 from bayesdist.infer.density.grid import build_proposal
 from bayesdist.infer.density.target import Target
 from bayesdist.infer.exposures.hierarchy import HierarchicalFit, fit_hierarchical

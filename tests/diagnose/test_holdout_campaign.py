@@ -18,7 +18,7 @@ from bayesdist.data.preparing import HoldoutSpec, split_matches
 from bayesdist.diagnose.holdout.predictive import frames_for
 from bayesdist.diagnose.holdout.validation import holdout_validation
 from bayesdist.errors import InputError
-from bayesdist.infer.catalogue.star_errors import star_covariance, star_influence
+from bayesdist.infer.catalogue.star_covariance import star_covariance, star_influence
 from bayesdist.report.sections.residuals import holdout_coverage, holdout_table
 from tests.diagnose.held_campaign import field, judged, solved
 from tests.reduced import only_in_full

@@ -9,7 +9,8 @@ import numpy as np
 
 from bayesdist.data.matches import Matches
 from bayesdist.infer import LinearFit
-from bayesdist.infer.catalogue.star_errors import StarCovariance, StarErrors, star_covariance
+from bayesdist.infer.catalogue.star_covariance import StarCovariance, star_covariance
+from bayesdist.infer.catalogue.star_errors import StarErrors
 from bayesdist.infer.equations.scaled import recolouring
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.infer.solution.transforms import lines, without_frames

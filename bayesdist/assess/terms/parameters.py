@@ -24,7 +24,7 @@ from bayesdist.assess.terms.forms import (
 )
 from bayesdist.assess.terms.functions import PolynomialField, Polynomials, polynomial_errors
 from bayesdist.errors import InputError, require_known
-from bayesdist.infer.catalogue.star_errors import StarCovariance
+from bayesdist.infer.catalogue.star_covariance import StarCovariance
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.model import DistortionModel
 from bayesdist.plugin import mission_objects

@@ -35,7 +35,7 @@ from bayesdist.diagnose.correlated.priors import DiscrepancyPriors, StructureFun
 from bayesdist.diagnose.correlated.result import ChipStructure, Discrepancy, structure_correlation
 from bayesdist.diagnose.correlated.structure import Structure, structure_posterior
 from bayesdist.diagnose.statistics import EfficientScore
-from bayesdist.infer.catalogue.star_errors import MatchesByStar, influence_by_group
+from bayesdist.infer.catalogue.star_covariance import MatchesByStar, influence_by_group
 from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.exposures.hierarchy import Settling

@@ -34,7 +34,7 @@ import numpy as np
 from scipy.special import ndtr, ndtri
 
 from bayesdist.data.matches import Matches
-from bayesdist.infer.catalogue.star_errors import StarInfluence
+from bayesdist.infer.catalogue.star_covariance import StarInfluence
 from bayesdist.infer.equations.scaled import determined
 from bayesdist.infer.posterior import Posterior
 from bayesdist.infer.stars.stars import errors_of

@@ -18,7 +18,8 @@ import numpy as np
 
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
-from bayesdist.infer.catalogue.star_errors import StarErrors, star_covariance, star_influence
+from bayesdist.infer.catalogue.star_covariance import star_covariance, star_influence
+from bayesdist.infer.catalogue.star_errors import StarErrors
 from bayesdist.infer.density.grid import build_proposal
 from bayesdist.infer.density.target import Target
 from bayesdist.infer.equations.priors import GaussianPriors

@@ -21,7 +21,8 @@ from bayesdist.data import Matches, ReferenceCatalog
 from bayesdist.diagnose.holdout.predictive import ExposureDeviations, Predictive, predictive_of
 from bayesdist.diagnose.overlap import OverlapTest
 from bayesdist.infer import GaussianPriors, LinearFit, Posterior
-from bayesdist.infer.catalogue.star_errors import StarErrors, StarInfluence, star_influence
+from bayesdist.infer.catalogue.star_covariance import StarInfluence, star_influence
+from bayesdist.infer.catalogue.star_errors import StarErrors
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.kinds.campaign.config import CampaignConfig
 from bayesdist.kinds.campaign.fit import fit_campaign

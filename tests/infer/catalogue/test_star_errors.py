@@ -12,7 +12,8 @@ from threadpoolctl import threadpool_limits
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer import GaussianPriors, Rejection, fit_linear
-from bayesdist.infer.catalogue.star_errors import StarErrors, star_covariance, star_influence
+from bayesdist.infer.catalogue.star_covariance import star_covariance, star_influence
+from bayesdist.infer.catalogue.star_errors import StarErrors
 from bayesdist.infer.exposures.hierarchy import fit_hierarchical
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.infer.solution.transforms import linear_terms, reference_gauge

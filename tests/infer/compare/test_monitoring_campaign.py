@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import binom, kstest
 
 from bayesdist.infer import OutlierMixture
-from bayesdist.infer.catalogue.star_errors import star_covariance
+from bayesdist.infer.catalogue.star_covariance import star_covariance
 from bayesdist.infer.compare.change_date import period_scores, scan_dates
 from bayesdist.infer.compare.monitoring import change_of, fit_new, with_star_errors_of
 from bayesdist.infer.exposures.hierarchy import fit_hierarchical
