@@ -26,15 +26,15 @@ from bayesdist.diagnose.overlap import OverlapTest
 from bayesdist.diagnose.periods import PeriodSettings, TimeVariation, time_variation
 from bayesdist.diagnose.residuals.binned import BinnedSums, Coverage, coverage_of
 from bayesdist.diagnose.residuals.misfit import (
-    MAX_BINS,
-    STARS_PER_BIN,
+    SHOWN,
+    Bins,
     EpochShift,
     Misfit,
     epoch_shift,
     explained_by_false_matches,
     majority_sentence,
-    misfit_of,
-    partitions_for,
+    misfits_by_star,
+    residual_sums,
     worst_misfit,
 )
 from bayesdist.diagnose.residuals.stars import (
@@ -45,9 +45,7 @@ from bayesdist.diagnose.residuals.stars import (
     dates_of,
     flagged_by_exposure,
     likelihood_shown,
-    star_bins,
     star_sample,
-    star_sums,
 )
 from bayesdist.diagnose.score.result import ScoreTest
 from bayesdist.diagnose.score.tests import score_tests
@@ -58,17 +56,13 @@ from bayesdist.infer.catalogue.star_errors import StarErrors
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.exposures.hierarchy import Settling
 from bayesdist.infer.posterior.checks import ChiSquare
-from bayesdist.infer.stars.likelihood import Likelihood
 from bayesdist.infer.stars.loading import opened
 from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.checks import EITHER, Check, warnings_of
 from bayesdist.utils.quantities import Number, Random, takes, value_in
 from bayesdist.utils.random import assessment_rng, restarted
 
-Bins = tuple[int, int]
-
 INSIDE = 0.5  # of the match radius: matches that end within it may have been cut at another radius
-SHOWN = "shown"  # name of the partition that is plotted as a map of mean residuals
 
 log = logging.getLogger("bayesdist")
 
@@ -452,7 +446,7 @@ def diagnose_fit(
     several = len(model.chips) > 1
     sample = star_sample(table, len(stars), fit, posterior)
     if eliminated is None:
-        misfits = _misfits(fit, stars, partitions, sums, shown)
+        misfits = misfits_by_star(fit, stars, partitions, sums, shown)
     else:
         misfits = eliminated.misfits()
         sample = replace(sample, taken=eliminated.absorbed(sample.table.row))
@@ -517,66 +511,6 @@ def _radius_doubt(sample: StarSample, match_radius: float) -> str:
         f"{largest:.3g}: if the matches were cut there, their errors are wrong, and "
         "outliers.match_radius has to be that radius"
     )
-
-
-def residual_sums(
-    fit: LinearFit, shards: Shards, solution: Likelihood | None
-) -> tuple[dict[int, dict[str, Bins]], StarSums]:
-    """Bins of each chip by the name of the partition, and sums of residuals in them.
-
-    `shards` contains all fitted stars.  `solution` provides the residuals and the probabilities of
-    true matches; it is the fit by default.
-    """
-    partitions = {}
-    for chip, chip_survey in zip(fit.model.chips, shards.survey.chips, strict=True):
-        n = round(fit.n_used * chip_survey.n / len(shards))
-        side = int(np.clip(np.sqrt(n / STARS_PER_BIN), 4, MAX_BINS))
-        partitions[chip.number] = partitions_for(n) | {SHOWN: (side, side)}
-    wanted = {chip: tuple(dict.fromkeys(bins.values())) for chip, bins in partitions.items()}
-    clipped = fit.likelihood
-    return partitions, shards.sum(star_sums, clipped, solution or clipped, wanted)
-
-
-def _misfits(
-    fit: LinearFit,
-    stars: Matches,
-    partitions: Mapping[int, Mapping[str, Bins]],
-    sums: StarSums,
-    shown: Likelihood,
-) -> tuple[Misfit, ...]:
-    """Structure in the residuals of each chip; detections of one star count as one.
-
-    `partitions` and `sums` are those of `residual_sums`.  They are used directly if each star has
-    one detection, or if the stars are not in memory.
-    """
-    code = stars.error_codes if stars.in_memory else None
-    if code is None or len(distinct := np.unique(code)) == len(stars):
-        return misfits_of(fit, partitions, sums)
-    used = fit.n_used * len(distinct) / len(stars)
-    by_star = {
-        chip.number: partitions_for(round(used * (stars.chip_number == chip.number).mean()))
-        for chip in fit.model.chips
-    }
-    wanted = {chip: tuple(dict.fromkeys(bins.values())) for chip, bins in by_star.items()}
-    binned = star_bins(stars, code, fit.model, shown, wanted)
-    return misfits_of(fit, by_star, replace(sums, binned=binned))
-
-
-def misfits_of(
-    fit: LinearFit, partitions: Mapping[int, Mapping[str, Bins]], sums: StarSums
-) -> tuple[Misfit, ...]:
-    """Structure in the residuals of each chip.
-
-    `partitions` and `sums` are those of `residual_sums`.
-    """
-    out = []
-    for chip, bins in zip(fit.model.chips, partitions.values(), strict=True):
-        binned = {
-            name: sums.binned[chip.number, size] for name, size in bins.items() if name != SHOWN
-        }
-        misfit = misfit_of(binned, order=fit.model.order, unit=fit.unit)
-        out.append(replace(misfit, chip=chip) if len(fit.model.chips) > 1 else misfit)
-    return tuple(out)
 
 
 @one_thread

@@ -16,7 +16,7 @@ from scipy import stats
 
 from bayesdist.diagnose import score_tests
 from bayesdist.diagnose.correlated.information import Information, cell_sums
-from bayesdist.diagnose.diagnostics import misfits_of, residual_sums
+from bayesdist.diagnose.residuals.misfit import misfits_of, residual_sums
 from bayesdist.diagnose.score.motions import motion_test
 from bayesdist.diagnose.score.sample import scored_sample
 from bayesdist.infer import GaussianPriors, load

@@ -10,9 +10,15 @@ from numpy.polynomial import legendre
 from scipy.stats import binom
 
 from bayesdist.data import Matches
-from bayesdist.diagnose.diagnostics import misfits_of, residual_sums
 from bayesdist.diagnose.residuals.binned import binned_sums
-from bayesdist.diagnose.residuals.misfit import Misfit, misfit_of, partitions_for, worst_misfit
+from bayesdist.diagnose.residuals.misfit import (
+    Misfit,
+    misfit_of,
+    misfits_of,
+    partitions_for,
+    residual_sums,
+    worst_misfit,
+)
 from bayesdist.infer import OutlierMixture, Rejection, fit_linear, load, sample
 from bayesdist.model import Chip, DistortionModel
 from tests.reduced import case_in_full

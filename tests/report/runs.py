@@ -29,7 +29,8 @@ from bayesdist.assess.comparison.compare import Comparison
 from bayesdist.assess.evaluation import Evaluation, EvaluationSettings
 from bayesdist.data.magnitude_errors import estimate
 from bayesdist.data.matches import Matches
-from bayesdist.diagnose.diagnostics import SHOWN, Diagnostics
+from bayesdist.diagnose.diagnostics import Diagnostics
+from bayesdist.diagnose.residuals.misfit import SHOWN
 from bayesdist.diagnose.residuals.stars import flagged_by_exposure, star_sample, star_sums
 from bayesdist.infer.catalogue.added_errors import GroupedErrors
 from bayesdist.infer.convergence import Convergence, Limits

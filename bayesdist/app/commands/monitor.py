@@ -19,8 +19,7 @@ from bayesdist.assess.comparison.change_maps import Monitored, change_maps, is_l
 from bayesdist.assess.comparison.compare import comparison_table, difference_table
 from bayesdist.assess.units import convert, pixel_scale_of
 from bayesdist.data import Matches, input_files
-from bayesdist.diagnose.diagnostics import misfits_of, residual_sums
-from bayesdist.diagnose.residuals.misfit import worst_misfit
+from bayesdist.diagnose.residuals.misfit import misfits_of, residual_sums, worst_misfit
 from bayesdist.errors import InputError
 from bayesdist.files.atomic import sha256_of
 from bayesdist.infer import Posterior

@@ -32,11 +32,14 @@ from numpy.polynomial import legendre
 from bayesdist.data.magnitude_errors import MAD_TO_SIGMA
 from bayesdist.data.matches import Matches
 from bayesdist.diagnose.residuals.binned import BinnedResiduals, BinnedSums
+from bayesdist.diagnose.residuals.stars import StarSums, star_bins, star_sums
 from bayesdist.diagnose.score.sample import ScoredSample, scored_sample
 from bayesdist.diagnose.statistics import squares_over
 from bayesdist.infer.posterior import Posterior
 from bayesdist.infer.solution.linear import LinearFit
 from bayesdist.infer.solution.solution import Solution
+from bayesdist.infer.stars.likelihood import Likelihood
+from bayesdist.infer.stars.shards import Shards
 from bayesdist.infer.stars.stars import prepare
 from bayesdist.model import Chip
 from bayesdist.model.basis import polynomial_terms
@@ -53,6 +56,9 @@ from bayesdist.utils.checks import (
 from bayesdist.utils.distributions import chi2_ppf, chi2_sf
 from bayesdist.utils.text import p_words, size_of
 
+Bins = tuple[int, int]
+
+SHOWN = "shown"  # name of the partition that is plotted as a map of mean residuals
 STARS_PER_BIN = 25
 MAX_BINS = 32  # along each side
 LOW_QUANTILE = 0.1  # of the chi-squares of the matches
@@ -134,6 +140,66 @@ def worst_misfit(found: Sequence[Misfit]) -> Misfit:
     # many p-values underflow to zero: then the larger structure is the worse one
     worst = min(found, key=lambda m: (m.p_value, -m.structure))
     return replace(worst, p_value=min(1.0, len(found) * worst.p_value))
+
+
+def residual_sums(
+    fit: LinearFit, shards: Shards, solution: Likelihood | None
+) -> tuple[dict[int, dict[str, Bins]], StarSums]:
+    """Bins of each chip by the name of the partition, and sums of residuals in them.
+
+    `shards` contains all fitted stars.  `solution` provides the residuals and the probabilities of
+    true matches; it is the fit by default.
+    """
+    partitions = {}
+    for chip, chip_survey in zip(fit.model.chips, shards.survey.chips, strict=True):
+        n = round(fit.n_used * chip_survey.n / len(shards))
+        side = int(np.clip(np.sqrt(n / STARS_PER_BIN), 4, MAX_BINS))
+        partitions[chip.number] = partitions_for(n) | {SHOWN: (side, side)}
+    wanted = {chip: tuple(dict.fromkeys(bins.values())) for chip, bins in partitions.items()}
+    clipped = fit.likelihood
+    return partitions, shards.sum(star_sums, clipped, solution or clipped, wanted)
+
+
+def misfits_by_star(
+    fit: LinearFit,
+    stars: Matches,
+    partitions: Mapping[int, Mapping[str, Bins]],
+    sums: StarSums,
+    shown: Likelihood,
+) -> tuple[Misfit, ...]:
+    """Structure in the residuals of each chip; detections of one star count as one.
+
+    `partitions` and `sums` are those of `residual_sums`.  They are used directly if each star has
+    one detection, or if the stars are not in memory.
+    """
+    code = stars.error_codes if stars.in_memory else None
+    if code is None or len(distinct := np.unique(code)) == len(stars):
+        return misfits_of(fit, partitions, sums)
+    used = fit.n_used * len(distinct) / len(stars)
+    by_star = {
+        chip.number: partitions_for(round(used * (stars.chip_number == chip.number).mean()))
+        for chip in fit.model.chips
+    }
+    wanted = {chip: tuple(dict.fromkeys(bins.values())) for chip, bins in by_star.items()}
+    binned = star_bins(stars, code, fit.model, shown, wanted)
+    return misfits_of(fit, by_star, replace(sums, binned=binned))
+
+
+def misfits_of(
+    fit: LinearFit, partitions: Mapping[int, Mapping[str, Bins]], sums: StarSums
+) -> tuple[Misfit, ...]:
+    """Structure in the residuals of each chip.
+
+    `partitions` and `sums` are those of `residual_sums`.
+    """
+    out = []
+    for chip, bins in zip(fit.model.chips, partitions.values(), strict=True):
+        binned = {
+            name: sums.binned[chip.number, size] for name, size in bins.items() if name != SHOWN
+        }
+        misfit = misfit_of(binned, order=fit.model.order, unit=fit.unit)
+        out.append(replace(misfit, chip=chip) if len(fit.model.chips) > 1 else misfit)
+    return tuple(out)
 
 
 def _absorbed(sums: BinnedSums, order: int | None) -> float:
