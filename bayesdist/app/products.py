@@ -32,14 +32,14 @@ from bayesdist.assess.terms.parameters import (
     MOTIONS,
     TIME_DEPENDENCE,
 )
-from bayesdist.calibration.calibration import Calibration, GaussianSolution, calibration_of
+from bayesdist.calibration.calibration import Calibration, calibration_of
 from bayesdist.calibration.chip_map import FurtherError
 from bayesdist.calibration.plane import ARCSEC, Plane
 from bayesdist.data.tangent import sky_of_plane
 from bayesdist.diagnose.residuals.stars import StarSample, star_sample
 from bayesdist.errors import InputError
 from bayesdist.files.atomic import atomic_path, path_within
-from bayesdist.infer.solution.solution import Solution
+from bayesdist.infer.solution.solution import GaussianSolution, Solution
 from bayesdist.model import LookupTable
 from bayesdist.plugin import mission_objects
 from bayesdist.products.common.celestial import sky_of_header

@@ -21,7 +21,7 @@ from bayesdist.calibration.chip_map import ChipMap, FurtherError, chip_of, sampl
 from bayesdist.calibration.inverse import ExplicitInverse
 from bayesdist.calibration.plane import ARCSEC, Plane
 from bayesdist.errors import InputError
-from bayesdist.infer.solution.solution import Solution
+from bayesdist.infer.solution.solution import GaussianSolution, Solution
 from bayesdist.infer.solution.transforms import at_exposure, without_frames
 from bayesdist.model import Chip, DistortionModel, LookupTable, TimeDependence, corrected
 from bayesdist.plugin import load_object
@@ -30,9 +30,7 @@ from bayesdist.utils.quantities import (
     Direction,
     Epoch,
     Number,
-    Random,
     direction_in,
-    generator_of,
     year_of,
 )
 
@@ -691,20 +689,6 @@ class Calibration:
             See `wcs`.
         """
         return self.wcs(chip, epoch=epoch, **sky).to_model()
-
-
-@dataclass(frozen=True, eq=False)
-class GaussianSolution(Solution):
-    """Solution that consists only of a mean and a covariance of its parameters."""
-
-    model: DistortionModel
-    mean: Float
-    cov: Float
-
-    def draws(self, n: int, rng: Random) -> Float:
-        """Random parameter vectors (n, D) from the normal distribution."""
-        generator = generator_of(rng)
-        return generator.multivariate_normal(self.mean, self.cov, size=n, method="eigh")
 
 
 def calibration_of(

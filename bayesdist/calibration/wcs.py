@@ -14,13 +14,13 @@ from astropy.wcs.wcsapi.high_level_api import HighLevelWCSMixin
 from numpy.typing import ArrayLike
 
 from bayesdist.calibration import hooks
-from bayesdist.calibration.calibration import Calibration, GaussianSolution
+from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.chip_map import ChipMap, chosen_chip
 from bayesdist.calibration.modeling import plane_model, sky_model
 from bayesdist.calibration.plane import Plane, SkyPlacement
 from bayesdist.calibration.sky_positions import placement_of, plane_covariances, sky_positions
 from bayesdist.errors import BayesdistError, InputError
-from bayesdist.infer.solution.solution import ParameterMap
+from bayesdist.infer.solution.solution import GaussianSolution, ParameterMap
 from bayesdist.infer.solution.transforms import at_exposure
 from bayesdist.plugin import load_object
 from bayesdist.utils.arrays import Bool, Float

@@ -14,10 +14,11 @@ from bayesdist.app.evaluating import _Laid, product_terms
 from bayesdist.app.products import ProductInput, made_files, product_of_run
 from bayesdist.app.run import Run
 from bayesdist.app.store.rundir import RunDirectory
-from bayesdist.calibration.calibration import GaussianSolution, calibration_of
+from bayesdist.calibration.calibration import calibration_of
 from bayesdist.calibration.plane import Plane
 from bayesdist.formats.sip.build import sip_from_solution
 from bayesdist.formats.sip.format import sip_positions
+from bayesdist.infer.solution.solution import GaussianSolution
 from bayesdist.missions.wise.meta_data.meta import read_wise_meta, write_wise_meta
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.products.common.document import BuildOptions

@@ -15,11 +15,12 @@ from astropy.table import QTable, Table
 from astropy.wcs import WCS
 
 import bayesdist as bd
-from bayesdist.calibration.calibration import Calibration, GaussianSolution
+from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.chip_map import FurtherError, scaled
 from bayesdist.calibration.plane import Plane
 from bayesdist.calibration.sky_positions import sky_positions
 from bayesdist.errors import InputError
+from bayesdist.infer.solution.solution import GaussianSolution
 from bayesdist.products.common.document import BuildOptions
 from bayesdist.products.registry import build, product_settings, read_calibration
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from bayesdist.calibration.calibration import Calibration, GaussianSolution
+from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.chip_map import FurtherError
 from bayesdist.calibration.plane import Plane
+from bayesdist.infer.solution.solution import GaussianSolution
 from bayesdist.model import Chip, DistortionModel, LookupTable, TimeDependence
 
 POINT = (5.0, 0.3)  # degrees: near 0, where a double has 3e-12 arcsec

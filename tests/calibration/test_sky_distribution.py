@@ -9,11 +9,12 @@ from astropy.coordinates import SkyCoord
 from astropy.time import Time
 from astropy.uncertainty import Distribution
 
-from bayesdist.calibration.calibration import Calibration, GaussianSolution
+from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.chip_map import FurtherError
 from bayesdist.calibration.plane import Plane
 from bayesdist.calibration.sky_positions import sky_distribution, sky_positions
 from bayesdist.errors import InputError
+from bayesdist.infer.solution.solution import GaussianSolution
 from bayesdist.model import Chip, DistortionModel
 
 CHIPS = (Chip(1, "S1", (400, 300), (200.5, 150.5)), Chip(2, "S2", (400, 300), (200.5, 150.5)))

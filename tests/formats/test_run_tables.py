@@ -10,7 +10,8 @@ from astropy.io import fits
 
 import bayesdist as bd
 from bayesdist.app.products import ProductInput, _left_out
-from bayesdist.calibration.calibration import GaussianSolution, calibration_of
+from bayesdist.calibration.calibration import calibration_of
+from bayesdist.infer.solution.solution import GaussianSolution
 from bayesdist.products.common.document import PARAMETERS, BuildOptions
 from bayesdist.products.registry import (
     all_formats,

@@ -10,11 +10,12 @@ from astropy.io import fits
 from astropy.wcs import WCS, FITSFixedWarning
 
 import bayesdist as bd
-from bayesdist.calibration.calibration import Calibration, GaussianSolution, calibration_of
+from bayesdist.calibration.calibration import Calibration, calibration_of
 from bayesdist.calibration.chip_map import FurtherError
 from bayesdist.calibration.plane import Plane
 from bayesdist.errors import InputError
 from bayesdist.formats import sip_from_solution
+from bayesdist.infer.solution.solution import GaussianSolution
 from bayesdist.missions.wise import simulate_wise
 from bayesdist.products.common.document import BuildOptions, Choice
 from bayesdist.products.registry import (

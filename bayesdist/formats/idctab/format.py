@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import PositiveFloat
 
-from bayesdist.calibration.calibration import Calibration, GaussianSolution, calibration_of_maps
+from bayesdist.calibration.calibration import Calibration, calibration_of_maps
 from bayesdist.calibration.chip_map import ChipMap, fitted_map
 from bayesdist.calibration.inverse import ExplicitInverse
 from bayesdist.calibration.plane import Plane
@@ -26,6 +26,7 @@ from bayesdist.formats.idctab.build import idctab_from_solution
 from bayesdist.formats.idctab.drift import RATES
 from bayesdist.formats.idctab.lint import LIMITS, lint_idctab, refuse_implausible
 from bayesdist.formats.idctab.table import FILTER_COLUMNS, HIGHEST, IdcTab, idctab_column, parity_of
+from bayesdist.infer.solution.solution import GaussianSolution
 from bayesdist.products.common.coefficients import largest_magnitude
 from bayesdist.products.common.content import Content
 from bayesdist.products.common.document import (

@@ -12,7 +12,7 @@ import numpy as np
 from bayesdist.errors import InputError
 from bayesdist.model import DistortionModel
 from bayesdist.utils.arrays import Bool, Float, Int
-from bayesdist.utils.quantities import Random
+from bayesdist.utils.quantities import Random, generator_of
 
 if TYPE_CHECKING:  # not imported at run time, so that inspecting a file stays fast
     from bayesdist.data.matches import Matches
@@ -184,6 +184,20 @@ class ReferenceGauge:
     shift: tuple[float, float]
     sigma_rotation: float
     sigma_shift: tuple[float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class GaussianSolution(Solution):
+    """Solution that consists only of a mean and a covariance of its parameters."""
+
+    model: DistortionModel
+    mean: Float
+    cov: Float
+
+    def draws(self, n: int, rng: Random) -> Float:
+        """Random parameter vectors (n, D) from the normal distribution."""
+        generator = generator_of(rng)
+        return generator.multivariate_normal(self.mean, self.cov, size=n, method="eigh")
 
 
 class DerivedSolution(Solution):

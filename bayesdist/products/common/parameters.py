@@ -22,11 +22,12 @@ from typing import Any
 import numpy as np
 from astropy.io import fits
 
-from bayesdist.calibration.calibration import Calibration, GaussianSolution
+from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.chip_map import further_from
 from bayesdist.calibration.inverse import detector_grid
 from bayesdist.calibration.plane import Plane
 from bayesdist.errors import FormatError
+from bayesdist.infer.solution.solution import GaussianSolution
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.products.common.cards import named_in, set_text, set_value
 from bayesdist.products.common.content import Content, Hdu, fits_bytes

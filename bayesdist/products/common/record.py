@@ -13,13 +13,14 @@ from typing import Any, NotRequired, TypedDict
 import numpy as np
 from pydantic import BaseModel, Field, TypeAdapter
 
-from bayesdist.calibration.calibration import Calibration, GaussianSolution
+from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.chip_map import further_from
 from bayesdist.calibration.inverse import detector_grid
 from bayesdist.calibration.orientation import in_arcsec
 from bayesdist.calibration.plane import Plane, arcsec_per
 from bayesdist.errors import BayesdistError, FormatError, InputError
 from bayesdist.files.documents import model_of
+from bayesdist.infer.solution.solution import GaussianSolution
 from bayesdist.model import Chip, DistortionModel, LookupTable
 from bayesdist.utils.arrays import Float
 from bayesdist.version import __version__

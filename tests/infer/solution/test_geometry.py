@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bayesdist.calibration.calibration import GaussianSolution
 from bayesdist.errors import InputError
 from bayesdist.infer.solution.geometry import geometry_of, refuse_geometry
+from bayesdist.infer.solution.solution import GaussianSolution
 from bayesdist.model import Chip, DistortionModel
 
 SIZE = (1000, 800)

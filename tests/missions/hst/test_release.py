@@ -11,13 +11,14 @@ import pytest
 from astropy.io import fits
 from numpy.testing import assert_allclose
 
-from bayesdist.calibration.calibration import GaussianSolution, calibration_of
+from bayesdist.calibration.calibration import calibration_of
 from bayesdist.calibration.plane import Orientation
 from bayesdist.errors import InputError
 from bayesdist.formats.idctab.build import idctab_from_solution
 from bayesdist.formats.idctab.drift import storable
 from bayesdist.formats.idctab.lint import lint_idctab
 from bayesdist.formats.idctab.table import combination_of, read_idctab
+from bayesdist.infer.solution.solution import GaussianSolution
 from bayesdist.infer.solution.transforms import reference_gauge
 from bayesdist.missions.hst.release import Period, Release, write_release
 from bayesdist.missions.hst.simulate import acs_solution
