@@ -17,8 +17,17 @@ from bayesdist.app.config import load_config
 from bayesdist.app.diagnosing import holdout_summary, holdout_table, periods_summary, periods_table
 from bayesdist.app.evaluating import idle_dates
 from bayesdist.app.parts import write_stored_fit
-from bayesdist.app.pipeline import diagnose, evaluate, export, fit, match, report, sample
-from bayesdist.app.rehearsal import rehearse, rehearse_solution
+from bayesdist.app.pipeline import (
+    diagnose,
+    evaluate,
+    export,
+    fit,
+    match,
+    rehearse,
+    rehearse_solution,
+    report,
+    sample,
+)
 from bayesdist.app.result_files import write_diagnostics, write_evaluation
 from bayesdist.app.run import Run
 from bayesdist.app.screen import log_file, progress_bar

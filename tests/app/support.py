@@ -19,7 +19,7 @@ from astropy.table import Table
 
 from bayesdist.app.cli import main
 from bayesdist.app.config import load_config
-from bayesdist.app.rehearsal import rehearse
+from bayesdist.app.pipeline import rehearse
 from bayesdist.app.run import Run
 from bayesdist.app.screen import start_logging
 from bayesdist.app.stages import ASSESS, initialized, make_stages

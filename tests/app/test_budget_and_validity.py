@@ -209,7 +209,7 @@ def test_errors_larger_than_the_residuals_are_told_by_assess(run, tmp_path, monk
     """As where the posterior takes more stars for false matches than the linear fit rejects."""
     folder = too_large(run, tmp_path / "run").parent
     with monkeypatch.context() as patch:
-        patch.setattr("bayesdist.app.rehearsal._check_residuals", lambda *_: None)
+        patch.setattr("bayesdist.app.pipeline._check_residuals", lambda *_: None)
         good("stage", "fit", folder, "-q")
     for stage in ("sample", "assess"):
         good("stage", stage, folder, "-q")

@@ -9,8 +9,8 @@ from tempfile import TemporaryDirectory
 from bayesdist.app.config import load_config
 from bayesdist.app.evaluating import idle_dates
 from bayesdist.app.kind import naming_displaced_stars
+from bayesdist.app.pipeline import rehearse
 from bayesdist.app.plausibility import doubts_on_run
-from bayesdist.app.rehearsal import rehearse
 from bayesdist.app.run import Run
 from bayesdist.app.screen import number
 from bayesdist.app.stars import in_circle

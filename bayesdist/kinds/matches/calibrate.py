@@ -16,9 +16,8 @@ import tomli_w
 
 from bayesdist.app.config import parse_config
 from bayesdist.app.config.results import RequirementBlock
-from bayesdist.app.pipeline import diagnose, evaluate, sample
+from bayesdist.app.pipeline import diagnose, evaluate, rehearse, sample
 from bayesdist.app.python_terms import in_python_terms
-from bayesdist.app.rehearsal import rehearse
 from bayesdist.app.run import Run
 from bayesdist.app.runs import MATCHES_FILE
 from bayesdist.app.screen import progress_bar
