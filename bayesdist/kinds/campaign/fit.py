@@ -51,12 +51,11 @@ from bayesdist.kinds.campaign.linear_terms import (
     ExposuresAlone,
     LinearTermScatter,
     gap_priors,
-    held_tables,
     line_sections,
-    rate_priors,
     with_gap,
 )
 from bayesdist.kinds.campaign.matching import affine_model_of
+from bayesdist.kinds.campaign.reference import held_tables, rate_priors
 from bayesdist.kinds.campaign.series import Series
 from bayesdist.model import Chip, DistortionModel, LookupTable, corrected
 from bayesdist.model.frames import RIGID

@@ -33,7 +33,7 @@ from bayesdist.errors import ConfigError, DegenerateError, InputError
 from bayesdist.files.tables import read_table
 from bayesdist.infer.catalogue.star_errors import StarErrors
 from bayesdist.kinds.campaign.config import CampaignBlock, CampaignConfig
-from bayesdist.kinds.campaign.linear_terms import held_tables, rehearse_references
+from bayesdist.kinds.campaign.reference import held_tables, rehearse_references
 from bayesdist.kinds.star_lists import StarLists, lists_of, refuse_other_chips
 from bayesdist.model import DistortionModel, LookupTable, TimeDependence
 from bayesdist.products.common.document import Document

@@ -4,8 +4,7 @@ ACS ISR 2015-06, Section 4.4.1, adopts one mean B_1 of WFC1 before SM4 and anoth
 drift in the model has a rate, and a step at each break, for every term and chip.  Those that are
 not wanted are held at zero by a prior much narrower than any measurement error.
 
-The terms of single exposures scatter about those of the model, and are a series in time.  The drift
-and the tables of the detector can be taken over from the run of the reference filter.
+The terms of single exposures scatter about those of the model, and are a series in time.
 """
 
 from __future__ import annotations
@@ -13,21 +12,16 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.app.config import Config
-from bayesdist.app.config.fit import TablesBlock
-from bayesdist.app.config.run import TABLES, rates_file, tables_file
-from bayesdist.app.parts import Part, converged_posterior, read_tables
+from bayesdist.app.parts import Part
 from bayesdist.app.run import Run
 from bayesdist.app.store.record import attributes, write_table
-from bayesdist.errors import DegenerateError, InputError
+from bayesdist.errors import DegenerateError
 from bayesdist.infer import GaussianPriors, Posterior
 from bayesdist.infer.exposures.hierarchy import Settling
-from bayesdist.infer.exposures.shared_drift import drift_priors
 from bayesdist.infer.solution.solution import Solution, TransformedSolution
 from bayesdist.infer.solution.transforms import lines, reference_gauge, without_frames
 from bayesdist.kinds.campaign.series import (
@@ -37,8 +31,7 @@ from bayesdist.kinds.campaign.series import (
     describe,
     fit_series,
 )
-from bayesdist.model import Chip, DistortionModel, LookupTable, TimeDependence
-from bayesdist.products.registry import open_document
+from bayesdist.model import DistortionModel, TimeDependence
 from bayesdist.utils.arrays import Float
 
 CONSTANTS = (("u", 0, 0), ("v", 0, 0))
@@ -253,52 +246,3 @@ def _predictions(posterior: SeriesPosterior) -> Table:
         columns[f"sigma_{name}"] = prediction.sigma[:, k]
         columns[f"sigma_new_{name}"] = prediction.sigma_new[:, k]
     return Table(columns)
-
-
-def held_tables(block: TablesBlock, chips: tuple[Chip, ...], base: Path) -> tuple[LookupTable, ...]:
-    """Look-up tables of the detector that are held fixed; empty if the configuration names none.
-
-    Raises InputError if any of `chips` has no table.
-    """
-    if block.detector is None:
-        return ()
-    path = tables_file(base / block.detector)
-    if path.name == TABLES:
-        stored = read_tables(path, do="run its stage 'fit' again").tables
-        tables = tuple(table for table in stored if not table.filter)
-    else:
-        tables = open_document(path).tables()
-    have = {table.chip for table in tables}
-    missing = [chip.name for chip in chips if chip.number not in have]
-    if missing:
-        raise InputError(
-            f"there is no table of the detector for chip {missing[0]}",
-            where=str(path),
-            do="name the run or the file of tables of this detector in tables.detector",
-        )
-    numbers = {chip.number for chip in chips}
-    ours = (table for table in tables if table.chip in numbers)
-    return tuple(sorted(ours, key=lambda table: table.chip))
-
-
-def rate_priors(config: Config, model: DistortionModel, base: Path) -> GaussianPriors | None:
-    """Priors on the drift of a model from the posterior of another run; None if it is free."""
-    tdd, chip = config.model.tdd, config.chips()[0].number
-    if tdd is None or config.has_free_rates:
-        return None
-    path = rates_file(base / tdd.rates)
-    posterior = converged_posterior(path, "its rates are used")
-    try:
-        named = drift_priors(posterior, model, chip=chip)
-    except InputError as error:
-        raise InputError(error.cause, where=str(path.parent), do=error.do) from error
-    return GaussianPriors.of(model, named)
-
-
-def rehearse_references(config: Config, unit: str, base: Path) -> None:
-    """Read everything that a run takes over from other runs, without fitting."""
-    chips = config.chips()
-    held_tables(config.tables, chips, base)
-    if not config.has_free_rates:
-        model = with_gap(DistortionModel(config.model.order, chips, unit, config.time()))
-        rate_priors(config, model, base)

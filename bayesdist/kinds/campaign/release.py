@@ -22,11 +22,11 @@ from bayesdist.app.screen import table_text
 from bayesdist.app.store.record import record_folder, write_table
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.errors import InputError
-from bayesdist.infer.exposures.shared_drift import with_drift_of
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.infer.solution.transforms import linear_terms, lines, reference_gauge, without_frames
 from bayesdist.kinds.campaign.config import CampaignConfig
 from bayesdist.kinds.campaign.linear_terms import ExposuresAlone
+from bayesdist.kinds.campaign.reference import with_drift_of
 from bayesdist.kinds.campaign.series import FilterDependence, Series, TrendModel, filter_dependence
 from bayesdist.model import LookupTable, TimeDependence
 from bayesdist.utils.arrays import Float

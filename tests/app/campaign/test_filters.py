@@ -25,10 +25,9 @@ from bayesdist.formats.idctab.table import read_idctab
 from bayesdist.formats.lookup.file import read_lookup_file
 from bayesdist.formats.lookup.tables import read_d2im
 from bayesdist.infer import load_fit, load_posterior
-from bayesdist.infer.exposures.shared_drift import drift_priors, with_drift_of
 from bayesdist.infer.nodes.fit import held_sigma
 from bayesdist.infer.solution.transforms import linear_terms, lines, reference_gauge, without_frames
-from bayesdist.kinds.campaign.linear_terms import held_tables
+from bayesdist.kinds.campaign.reference import drift_priors, held_tables, with_drift_of
 from bayesdist.kinds.campaign.release import _require_alike, compare_filters
 from bayesdist.kinds.campaign.series import Series, fit_series
 from bayesdist.missions.hst.simulate import acs_solution, making, read_acs, simulate_acs

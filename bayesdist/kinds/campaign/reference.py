@@ -1,22 +1,31 @@
-"""Use of the drift of one solution in another, for example for a filter with few exposures.
+"""Drift and look-up tables that a campaign takes over from the run of a reference filter.
 
 In Kozhurina-Platais et al. (2015, section 4.4.4), the time dependence is derived in one filter and
-applied to all. Rates and steps are transformed to the reference gauge, so that the orientations of
-the catalogues and of the first exposures do not matter.
+applied to all, for example to a filter with few exposures.  Rates and steps are transformed to the
+reference gauge, so that the orientations of the catalogues and of the first exposures do not
+matter.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
+from bayesdist.app.config import Config
+from bayesdist.app.config.fit import TablesBlock
+from bayesdist.app.config.run import TABLES, rates_file, tables_file
+from bayesdist.app.parts import converged_posterior, read_tables
 from bayesdist.errors import DegenerateError, InputError
+from bayesdist.infer import GaussianPriors
 from bayesdist.infer.equations.scaled import scaled_inverse, unit_diagonal
 from bayesdist.infer.solution.solution import DerivedSolution, Solution
 from bayesdist.infer.solution.transforms import reference_gauge, without_frames
-from bayesdist.model import DistortionModel
+from bayesdist.kinds.campaign.linear_terms import with_gap
+from bayesdist.model import Chip, DistortionModel, LookupTable
 from bayesdist.model.alignment import turned, turned_model
+from bayesdist.products.registry import open_document
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.quantities import Random, generator_of
 
@@ -131,6 +140,55 @@ def drift_priors(
     names = model.names[model.n_polynomial : model.n_distortion]
     pairs = zip(mean.tolist(), (np.sqrt(largest) * sigma).tolist(), strict=True)
     return dict(zip(names, pairs, strict=True))
+
+
+def held_tables(block: TablesBlock, chips: tuple[Chip, ...], base: Path) -> tuple[LookupTable, ...]:
+    """Look-up tables of the detector that are held fixed; empty if the configuration names none.
+
+    Raises InputError if any of `chips` has no table.
+    """
+    if block.detector is None:
+        return ()
+    path = tables_file(base / block.detector)
+    if path.name == TABLES:
+        stored = read_tables(path, do="run its stage 'fit' again").tables
+        tables = tuple(table for table in stored if not table.filter)
+    else:
+        tables = open_document(path).tables()
+    have = {table.chip for table in tables}
+    missing = [chip.name for chip in chips if chip.number not in have]
+    if missing:
+        raise InputError(
+            f"there is no table of the detector for chip {missing[0]}",
+            where=str(path),
+            do="name the run or the file of tables of this detector in tables.detector",
+        )
+    numbers = {chip.number for chip in chips}
+    ours = (table for table in tables if table.chip in numbers)
+    return tuple(sorted(ours, key=lambda table: table.chip))
+
+
+def rate_priors(config: Config, model: DistortionModel, base: Path) -> GaussianPriors | None:
+    """Priors on the drift of a model from the posterior of another run; None if it is free."""
+    tdd, chip = config.model.tdd, config.chips()[0].number
+    if tdd is None or config.has_free_rates:
+        return None
+    path = rates_file(base / tdd.rates)
+    posterior = converged_posterior(path, "its rates are used")
+    try:
+        named = drift_priors(posterior, model, chip=chip)
+    except InputError as error:
+        raise InputError(error.cause, where=str(path.parent), do=error.do) from error
+    return GaussianPriors.of(model, named)
+
+
+def rehearse_references(config: Config, unit: str, base: Path) -> None:
+    """Read everything that a run takes over from other runs, without fitting."""
+    chips = config.chips()
+    held_tables(config.tables, chips, base)
+    if not config.has_free_rates:
+        model = with_gap(DistortionModel(config.model.order, chips, unit, config.time()))
+        rate_priors(config, model, base)
 
 
 def _in_gauge(

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from bayesdist.errors import DegenerateError, InputError
-from bayesdist.infer.exposures.shared_drift import drift_priors, with_drift_of
 from bayesdist.infer.solution.transforms import lines, reference_gauge, without_frames
+from bayesdist.kinds.campaign.reference import drift_priors, with_drift_of
 from bayesdist.model import TimeDependence
 from bayesdist.model.alignment import turned, turned_model
 from tests.infer.solution.test_transforms import Gaussian, acs
