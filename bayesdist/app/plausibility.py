@@ -11,6 +11,8 @@ from bayesdist.app.config import Config
 from bayesdist.app.kind import doubts_on_numbers
 from bayesdist.app.run import Run
 from bayesdist.data import Matches
+from bayesdist.data.tables.checks import ZERO_MOTION
+from bayesdist.data.tables.names import NO_MOTION
 from bayesdist.data.tangent import sky_of_plane
 from bayesdist.errors import InputError
 from bayesdist.model import DistortionModel, TimeDependence
@@ -49,6 +51,10 @@ LOW_ORDER = 1.7  # ratio of scatters about two orders above which the lower orde
 BEST_ORDER = 1.2  # ratio of scatters below which two orders are equally good
 IN_PEAK = 0.4  # part of the residuals: fewer than those of the larger of two groups of stars
 MOST_STARS = 1500  # used to compare orders
+USE_WITHOUT_MOTION = (
+    "to use them, set data.sigma to 'columns' and name columns with the errors of positions and "
+    "motions, and give data.motion_prior if fewer than 30 stars have a motion"
+)
 YEARS = (1950.0, 2100.0)
 
 
@@ -60,6 +66,13 @@ def doubts_on_stars(stars: Matches, model: DistortionModel, config: Config) -> l
         doubt = config.catalogue.catalogue().doubt_on_pointings(apart)
         doubts += [doubt] if doubt else []
     return [*doubts, *_doubts_on_order(stars, model.order)]
+
+
+def left_out(stars: Matches) -> Iterator[str]:
+    """Number of rows that were left out in reading, for each reason, and how to use them."""
+    for reason, count in stars.rejected.items():
+        remedy = f"; {USE_WITHOUT_MOTION}" if reason in (NO_MOTION, ZERO_MOTION) else ""
+        yield f"{count} rows: {reason}{remedy}"
 
 
 def doubts_on_run(run: Run) -> list[str]:

@@ -35,7 +35,7 @@ from bayesdist.data.reading.options import (
 )
 from bayesdist.data.reading.table import match_arguments, sky_table
 from bayesdist.data.repeated import check_same_position, error_codes, star_codes
-from bayesdist.data.tables.names import ASSUMED
+from bayesdist.data.tables.names import ASSUMED, NO_MOTION
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.quantities import Direction, Epoch, Number, values_in
@@ -852,7 +852,7 @@ class Matches(MatchColumns):
                 where=", ".join(self.sources),
                 do="give measured motions, or errors as columns",
             )
-        return self.select(~assumed, reason="no proper motion") if assumed.any() else self
+        return self.select(~assumed, reason=NO_MOTION) if assumed.any() else self
 
     def with_errors(self, errors: Errors, *, in_quadrature: bool = False) -> Matches:
         """These stars with other errors.

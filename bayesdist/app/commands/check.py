@@ -10,7 +10,7 @@ from bayesdist.app.config import load_config
 from bayesdist.app.evaluating import idle_dates
 from bayesdist.app.kind import naming_displaced_stars
 from bayesdist.app.pipeline import rehearse
-from bayesdist.app.plausibility import doubts_on_run
+from bayesdist.app.plausibility import doubts_on_run, left_out
 from bayesdist.app.run import Run
 from bayesdist.app.screen import number
 from bayesdist.app.stars import in_circle
@@ -62,8 +62,8 @@ def _lines(run: Run) -> Iterator[str]:
     for note in matches.notes:
         if note not in stated:  # otherwise logged as a warning when its file was read
             yield f"read         {note}"
-    for reason, count in matches.rejected.items():
-        yield f"left out     {count} rows: {reason}"
+    for text in left_out(matches):
+        yield f"left out     {text}"
     yield (
         f"errors       median {number(sigma)} {matches.unit}"
         + (" (by magnitude)" if run.errors.by_magnitude is not None else "")

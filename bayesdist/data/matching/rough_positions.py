@@ -25,7 +25,7 @@ from bayesdist.data.reading.table import SKY_COLUMN, as_table, icrs_of, own_epoc
 from bayesdist.data.sky import MOTIONS, PARAMETERS, SKY_QUANTITIES, reference_sky, sky_columns
 from bayesdist.data.tables.checks import without_missing
 from bayesdist.data.tables.column import Quantities
-from bayesdist.data.tables.names import ALIASES, ASSUMED, PAIRS, find_columns, origin_of
+from bayesdist.data.tables.names import ALIASES, ASSUMED, NO_MOTION, PAIRS, find_columns, origin_of
 from bayesdist.data.tangent import sky_of_plane, tangent_jacobian
 from bayesdist.errors import InputError
 from bayesdist.files.tables import read_table
@@ -276,7 +276,7 @@ def catalogue_stars(
     mag = None
     if "mag" in column_names:
         mag = np.nan_to_num(quantities["mag"].known_numbers(), nan=np.inf)
-    n_unmoved = counts.get("no proper motion", 0)
+    n_unmoved = counts.get(NO_MOTION, 0)
     return StarsOnSky(quantities, rows, moving, epoch, mag, notes, n_unmoved)
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.data.tables.names import NO_MOTION
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Bool
 
@@ -211,7 +212,7 @@ def without_missing(
     for key, name in found.items():
         if key in spared:
             continue
-        reason = "no proper motion" if key in motions else f"no value in column {name!r}"
+        reason = NO_MOTION if key in motions else f"no value in column {name!r}"
         gone = absent(table[name], not_finite=reject or key in motions)
         reasons.append((reason, gone))
     stay, counts = counted(reasons, len(table))

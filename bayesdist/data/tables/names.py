@@ -8,8 +8,9 @@ from typing import Any
 
 from bayesdist.errors import InputError
 
-# lower case; the first name that the file has is used, and for a pair the first that both have
+NO_MOTION = "no proper motion"  # reason for which stars without a motion are left out
 ASSUMED = "assumed_motion"  # quantity that is 1 for stars without a measured motion
+# lower case; the first name that the file has is used, and for a pair the first that both have
 BASIC: dict[str, tuple[str, ...]] = {
     "x": ("x", "x_pix", "xpix", "x_raw", "xraw", "xwin_image", "xpsf_image", "x_image"),
     "y": ("y", "y_pix", "ypix", "y_raw", "yraw", "ywin_image", "ypsf_image", "y_image"),

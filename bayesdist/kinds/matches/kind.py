@@ -25,6 +25,7 @@ from bayesdist.app.parts import (
 from bayesdist.app.plausibility import (
     doubt_on_positions,
     doubts_on_run,
+    left_out,
     refuse_empty_segments,
     refuse_stars,
 )
@@ -97,8 +98,8 @@ class MatchesKind(RunKind[MatchesConfig, Matches]):
         for note in matches.notes:
             if note not in logged:
                 yield logging.INFO, note
-        for reason, count in matches.rejected.items():
-            yield logging.INFO, f"{count} rows were left out in reading: {reason}"
+        for text in left_out(matches):
+            yield logging.INFO, f"left out in reading: {text}"
         for text in doubts_on_run(run):
             yield logging.WARNING, text
         shift = epoch_shift(run.sample, fit)

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from astropy.table import Table
+from astropy.table import MaskedColumn, Table
 
 from bayesdist.data import read_matches, tangent_plane
 from bayesdist.infer import load_posterior
@@ -251,3 +251,21 @@ def test_tables_in_memory_are_matches():
     np.testing.assert_array_equal(of_frame.u, np.delete(of_table.u, 3))
     np.testing.assert_array_equal(of_arrays.v, of_table.v)
     np.testing.assert_allclose(of_table.u, field.xi, atol=1e-6)
+
+
+def test_the_way_to_use_stars_without_motions_is_named_and_works(tmp_path):
+    config = early_field(tmp_path, mjd=53772.0)
+    table = Table.read(tmp_path / "gaia.csv")
+    for name in ("pmra", "pmra_error", "pmdec", "pmdec_error", "parallax", "parallax_error"):
+        table[name] = MaskedColumn(table[name], mask=np.arange(len(table)) % 3 == 0)
+    table.write(tmp_path / "gaia.csv", overwrite=True)
+    text = config.read_text()
+    out = good("check", config).out
+    words = "left out     500 rows: no proper motion; to use them, set data.sigma to 'columns'"
+    assert words in out and "data.motion_prior if fewer than 30 stars have a motion" in out
+    text = text.replace('sigma = "by_magnitude"', 'sigma = "columns"')
+    named = "{sigma_ra = 'ra_error', sigma_dec = 'dec_error', "
+    config.write_text(text.replace("columns = {", f"columns = {named}"))
+    out = good("check", config).out
+    assert "left out" not in out and "1500 of 1500 rows" in out
+    assert "500 of 1500 rows have no motion; they were given that of the others" in out
