@@ -11,6 +11,14 @@ factor or along an axis.  The factors s_k allow for tails and for errors that di
 star.  If it is much more likely, S of the group differs from that of the others, as the motions of
 single stars make it.
 
+The share p of the group may also vary over the field, as it does if visits with different pointing
+or fields of view have been merged:
+
+    logit p = b_0 + b_1 X + b_2 Y
+
+The solution then follows the mean displacement p d, so that the centres of both parts are those
+above minus (p - p_0) d, where p_0 is p at X = Y = 0.
+
 The alternative is noise about a single centre, with the same false matches: any elliptical
 distribution in units of the errors (Student's t, errors that are wrong by various factors, matches
 that were cut at a radius in units of their errors), two such distributions of different shapes,
@@ -20,10 +28,10 @@ stated ones without a common part, since errors that were estimated from the res
 jitter include the displacement.
 
 Twice the logarithm of the ratio of both likelihoods is compared with chi-square of `GROUP_DOF`
-degrees of freedom.  The noise has more freedom than the mixture without its group, so that the
-ratio is mostly below one where there is no group; the five parameters of the group do not have a
-chi-square distribution themselves, because p = 0 and d = 0 are the same.  Fits of simulated noise
-show that the p-values are larger than chance (docs/validation.md).
+degrees of freedom, and two more if p varies.  The noise has more freedom than the mixture without
+its group, so that the ratio is mostly below one where there is no group; the parameters of the
+group do not have a chi-square distribution themselves, because p = 0 and d = 0 are the same.  Fits
+of simulated noise show that the p-values are larger than chance (docs/validation.md).
 """
 
 from __future__ import annotations
@@ -33,7 +41,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import ndtr
+from scipy.special import expit, logit, ndtr
 
 from bayesdist.diagnose.score.missing_orders import ChipResiduals, rotations
 from bayesdist.diagnose.score.sample import ScoredSample
@@ -50,7 +58,10 @@ SEARCH_PASSES = 8
 START_PASSES = 5  # over those with which it compares where it may begin
 LEAST_GAIN = 3.0
 LEAST_OF_OWN = 3.0  # gain in log-likelihood for which the group has a matrix S of its own
+MORE_LIKELY = 1.5  # factor by which a varying share must raise the gain in log-likelihood
 GROUP_DOF = 8  # of the chi-square distribution that bounds twice the gain; see above
+START_SLOPE = 2.0  # of logit p, from which fits of a varying share begin
+LARGEST_LOGIT = 6.0  # of p at the centre, and of its slopes
 PASSES = 40
 SCALES = np.array([0.45, 0.7, 1.0, 1.5, 2.4])  # s_k
 WIDE = 4.0  # smallest scatter of false matches, in typical errors
@@ -76,13 +87,19 @@ class DisplacedGroup:
     shift: tuple[float, float]  # from the larger group to the smaller one, along u and v
     shift_sigma: tuple[float, float]
     separation: float  # its length in units of the scatter of the larger group along it
+    # shares that 5 % and 95 % of the stars have, if the share varies over the field
+    between: tuple[float, float] | None = None
 
     def sentence(self, unit: str) -> str:
         """Clause on the share of the stars and their displacement in the unit of u and v."""
         along = [_with_error(*pair) for pair in zip(self.shift, self.shift_sigma, strict=True)]
+        varies = ""
+        if self.between is not None:
+            low, high = (f"{100 * share:.0f}" for share in self.between)
+            varies = f" (from {low} to {high} % over the field)"
         return (
             "a part of the stars is displaced from the others as a whole: "
-            f"{_with_error(100 * self.share, 100 * self.share_sigma)} % of them by "
+            f"{_with_error(100 * self.share, 100 * self.share_sigma)} % of them{varies} by "
             f"{along[0]} {unit} along u and {along[1]} {unit} along v"
         )
 
@@ -117,30 +134,31 @@ def displaced_group(
     DisplacedGroup or None
         None if there are too few stars, or nothing like a group.
     """
-    residual, covariance = _by_star(sample, chips, terms_up_to)
+    residual, covariance, position = _by_star(sample, chips, terms_up_to)
     n = residual.shape[1]
     if n < MIN_STARS or not np.median((residual**2).sum(axis=0)) > TINY:
         return None
     order = np.random.default_rng(1).permutation(n)[:MAX_STARS]
-    residual, covariance = residual[:, order], covariance[:, order]
-    possible = [_Stars.of(residual, errors) for errors in _possible_errors(covariance)]
+    residual, covariance, position = residual[:, order], covariance[:, order], position[:, order]
+    possible = [_Stars.of(residual, errors, position) for errors in _possible_errors(covariance)]
     # the last errors, between the stated and equal ones, are tried only where these show a group
-    mixtures, largest, noise = zip(*(_searched(stars) for stars in possible[:2]), strict=True)
-    if not max(largest) >= max(noise) + LEAST_GAIN:
+    searched = [_searched(stars) for stars in possible[:2]]
+    if not max(s.likelihood for s in searched) >= max(s.noise for s in searched) + LEAST_GAIN:
         return None
-    mixtures = (*mixtures, *(_searched(stars)[0] for stars in possible[2:]))
-    further = [] if len(possible) == 1 else _with_jitter(residual, covariance)
-    return _tested(list(zip(possible, mixtures, strict=True)), further)
+    searched += [_searched(stars) for stars in possible[2:]]
+    found = [(stars, m) for stars, s in zip(possible, searched, strict=True) for m in s.mixtures]
+    further = [] if len(possible) == 1 else _with_jitter(residual, covariance, position)
+    return _tested(found, further)
 
 
 def _by_star(
     sample: ScoredSample, chips: Sequence[ChipResiduals], terms_up_to: int
-) -> tuple[Float, Float]:
-    """Mean residuals (2, n) of single stars along u and v, and their covariances (3, n).
+) -> tuple[Float, Float, Float]:
+    """Mean residuals (2, n) of single stars along u and v, their covariances (3, n) and places.
 
-    The elements of these are uu, uv and vv.
+    The elements of the covariances are uu, uv and vv. The places (2, n) are X and Y on the chip.
     """
-    residuals, covariances = [np.zeros((2, 0))], [np.zeros((3, 0))]
+    residuals, covariances, places = [np.zeros((2, 0))], [np.zeros((3, 0))], [np.zeros((2, 0))]
     for chip in chips:
         part, most = chip, MAX_STARS // len(chips)
         if chip.n_stars > most:
@@ -155,15 +173,21 @@ def _by_star(
         uu, vv = sample.variance[:, rows]
         uv = np.zeros(len(rows)) if sample.covariance is None else sample.covariance[rows]
         covariance = np.stack([uu, uv, vv])
+        place = np.stack([part.X, part.Y])
         if part.n_stars < len(rows):
             weight = 1.0 / (uu + vv)
             total = np.bincount(part.star, weight)
             residual = sums_over(part.star, (weight * residual).T).T / total
             # as if detections were independent: a common error is a factor s_k
             covariance = sums_over(part.star, (weight**2 * covariance).T).T / total**2
+            place = sums_over(part.star, (weight * place).T).T / total
         residuals.append(residual)
         covariances.append(covariance)
-    return np.concatenate(residuals, axis=1), np.concatenate(covariances, axis=1)
+        places.append(place)
+    residual, covariance, place = (
+        np.concatenate(several, axis=1) for several in (residuals, covariances, places)
+    )
+    return residual, covariance, place
 
 
 def _possible_errors(covariance: Float) -> Iterator[Float]:
@@ -190,30 +214,33 @@ class _Stars:
     whitening: Float  # (3, n) elements uu, uv, vv of the inverse roots of the covariances
     z: Float  # (2, n) whitened residuals
     log_det: Float  # (n,) logarithm of the determinant of the whitening
+    position: Float  # (2, n) X and Y on the chip
     typical: float  # median error per axis
 
     @classmethod
-    def of(cls, residual: Float, covariance: Float) -> _Stars:
-        """Build from residuals (2, n) and the elements (3, n) of their covariances."""
+    def of(cls, residual: Float, covariance: Float, position: Float) -> _Stars:
+        """Build from residuals (2, n), the elements (3, n) of their covariances, and X and Y."""
         uu, uv, vv = covariance
         # root of a symmetric 2 x 2 matrix C: (C + d) / t, with d^2 = |C| and t^2 = trace + 2 d
         d = np.sqrt(np.maximum(uu * vv - uv**2, TINY))
         t = np.sqrt(uu + vv + 2 * d)
         whitening = np.stack([vv + d, -uv, uu + d]) / (d * t)
         z = _product(whitening, residual)
-        return cls(residual, whitening, z, -np.log(d), float(np.sqrt(np.median(uu + vv) / 2)))
+        typical = float(np.sqrt(np.median(uu + vv) / 2))
+        return cls(residual, whitening, z, -np.log(d), position, typical)
 
     def at(self, rows: slice) -> _Stars:
         """Subset of the stars."""
-        columns = (self.residual, self.whitening, self.z, self.log_det)
-        residual, whitening, z, log_det = (column[..., rows] for column in columns)
-        return _Stars(residual, whitening, z, log_det, self.typical)
+        columns = (self.residual, self.whitening, self.z, self.log_det, self.position)
+        residual, whitening, z, log_det, position = (column[..., rows] for column in columns)
+        return _Stars(residual, whitening, z, log_det, position, self.typical)
 
 
 class _Mixture(NamedTuple):
     """Parameters of B mixtures."""
 
-    share: Float  # (B,) p
+    share: Float  # (B,) p, at X = Y = 0 if it varies
+    slope: Float  # (B, 2) of logit p along X and Y
     centre: Float  # (B, 2, 2) of the stars and of the displaced group, along u and v
     shape: Float  # (B, 2, 2, 2) S of both
     scales: Float  # (B, k) weights w_k
@@ -229,6 +256,22 @@ class _Mixture(NamedTuple):
         """A single mixture n times."""
         return _Mixture(*(np.repeat(parameter, n, axis=0) for parameter in self))
 
+    @property
+    def varies(self) -> bool:
+        """True if the share of the groups varies over the field."""
+        return bool(self.slope.any())
+
+    @property
+    def shift(self) -> Float:
+        """Displacements (B, 2) of the groups along u and v."""
+        return np.asarray(self.centre[:, 1] - self.centre[:, 0])
+
+    def shares(self, position: Float) -> Float:
+        """Shares (B, n) of the groups at X and Y (2, n), or (B, 1) if they do not vary."""
+        if not self.varies:
+            return self.share[:, None]
+        return np.asarray(expit(logit(self.share)[:, None] + self.slope @ position))
+
 
 def _single(stars: _Stars, n_scales: int) -> _Mixture:
     """Mixture with a single centre from which fits start."""
@@ -239,6 +282,7 @@ def _single(stars: _Stars, n_scales: int) -> _Mixture:
     shape = (weight * z) @ z.T / weight.sum()
     return _Mixture(
         np.zeros(1),
+        np.zeros((1, 2)),
         np.zeros((1, 2, 2)),
         np.stack([shape, shape])[None],
         np.full((1, n_scales), 1.0 / n_scales),
@@ -248,22 +292,30 @@ def _single(stars: _Stars, n_scales: int) -> _Mixture:
     )
 
 
-def _searched(stars: _Stars) -> tuple[_Mixture, float, float]:
-    """Best of many mixtures with Gaussian errors, with its log-likelihood and that of the noise.
+class _Searched(NamedTuple):
+    """Mixtures with which a search ends, whose errors are Gaussian, and log-likelihoods."""
 
-    The noise is an elliptical distribution about a single centre.
-    """
-    one, every = np.ones(1), stars
-    single = _fitted(every, _single(every, 1), one, SEARCH_PASSES, one_centre=True)
+    mixtures: tuple[_Mixture, _Mixture]  # with one share, and with one that varies
+    likelihood: float  # of the better one
+    noise: float  # of an elliptical distribution about a single centre
+
+
+def _searched(stars: _Stars) -> _Searched:
+    """Best of many mixtures whose share is the same everywhere, and of those whose share varies."""
+    unit, every = np.ones(1), stars
+    single = _fitted(every, _single(every, 1), unit, SEARCH_PASSES, one_centre=True)
     stars = every.at(slice(0, SEARCH_STARS))
     total = single.shape[0, 0]
     root = np.linalg.cholesky(total)
     angle = np.arange(8) * np.pi / 4
     ways = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    # in units of the total scatter: share, distance, number of directions
-    starts = [(0.5, 1.7, 4), (0.25, 2.5, 8), (0.12, 4.5, 8)]
-    share = np.concatenate([np.full(n, p) for p, _, n in starts])
-    shift = np.concatenate([d * ways[:n] for _, d, n in starts])
+    # in units of the total scatter: share, distance, number of directions, slopes of the share
+    one = [(0.0, 0.0)]
+    rising = [(START_SLOPE, 0.0), (-START_SLOPE, 0.0), (0.0, START_SLOPE), (0.0, -START_SLOPE)]
+    starts = [(0.5, 1.7, 4, one), (0.25, 2.5, 8, one), (0.12, 4.5, 8, one), (0.5, 2.0, 4, rising)]
+    share = np.concatenate([np.full(n * len(slopes), p) for p, _, n, slopes in starts])
+    shift = np.concatenate([np.tile(d * ways[:n], (len(slopes), 1)) for _, d, n, slopes in starts])
+    slope = np.concatenate([np.repeat(slopes, n, axis=0) for _, _, n, slopes in starts])
     whitening = _matrices(*np.median(stars.whitening, axis=1))
     along = shift @ root.T  # whitened
     shift = along @ np.linalg.inv(whitening)
@@ -277,6 +329,7 @@ def _searched(stars: _Stars) -> tuple[_Mixture, float, float]:
     B = len(share)
     start = _Mixture(
         share,
+        slope,
         centre,
         np.stack([shape, shape], axis=1),
         np.ones((B, 1)),
@@ -284,15 +337,19 @@ def _searched(stars: _Stars) -> tuple[_Mixture, float, float]:
         np.repeat(single.wide_centre, B, axis=0),
         np.repeat(single.wide, B),
     )
-    fits = _fitted(stars, start, one, START_PASSES)
-    density = _log_density(stars, fits, one).sum(axis=1)
-    best = fits.best(int(np.argmax(np.nan_to_num(density, nan=-np.inf))))
-    fit = _fitted(every, best, one, SEARCH_PASSES)
-    likelihood = float(_log_density(every, fit, one).sum())
-    return fit, likelihood, _elliptical(every, single, one)
+    varies = slope.any(axis=1)
+    best = []
+    for these in (~varies, varies):
+        several = _Mixture(*(parameter[these] for parameter in start))
+        fits = _fitted(stars, several, unit, START_PASSES)
+        density = _log_density(stars, fits, unit).sum(axis=1)
+        likeliest = fits.best(int(np.argmax(np.nan_to_num(density, nan=-np.inf))))
+        best.append(_fitted(every, likeliest, unit, SEARCH_PASSES))
+    likelihood = max(float(_log_density(every, fit, unit).sum()) for fit in best)
+    return _Searched((best[0], best[1]), likelihood, _elliptical(every, single, unit))
 
 
-def _with_jitter(residual: Float, covariance: Float) -> list[_Stars]:
+def _with_jitter(residual: Float, covariance: Float, position: Float) -> list[_Stars]:
     """Stars with an error that is common to all in addition to the stated ones, of several sizes.
 
     Two groups add to errors in the same way: more, in units of the stated ones, where these are
@@ -300,7 +357,7 @@ def _with_jitter(residual: Float, covariance: Float) -> list[_Stars]:
     """
     typical = float(np.median(covariance[0] + covariance[2])) / 2
     round_error = np.array([1.0, 0.0, 1.0])[:, None] * typical
-    return [_Stars.of(residual, covariance + factor * round_error) for factor in JITTERS]
+    return [_Stars.of(residual, covariance + factor * round_error, position) for factor in JITTERS]
 
 
 def _tested(found: list[tuple[_Stars, _Mixture]], further: list[_Stars]) -> DisplacedGroup:
@@ -311,10 +368,11 @@ def _tested(found: list[tuple[_Stars, _Mixture]], further: list[_Stars]) -> Disp
     n_scales = len(SCALES)
     weights = np.full((1, n_scales), 0.1 / (n_scales - 1))
     weights[0, int(np.argmin(np.abs(SCALES - 1.0)))] = 0.9
-    best, largest = None, -np.inf
     single = max((next(_noise(stars)) for stars in further), default=-np.inf)
+    fits: list[tuple[_Stars, _Mixture, float]] = []
     for stars, start in found:
-        single = max(single, *_noise(stars))
+        if not fits or fits[-1][0] is not stars:
+            single = max(single, *_noise(stars))
         fit = _fitted(stars, start._replace(scales=weights), SCALES, PASSES)
         # the same mixture about one centre, so that the noise is not only further from its maximum
         middle = (1 - fit.share[0]) * fit.centre[:, :1] + fit.share[0] * fit.centre[:, 1:]
@@ -322,16 +380,17 @@ def _tested(found: list[tuple[_Stars, _Mixture]], further: list[_Stars]) -> Disp
         merged = _fitted(stars, merged, SCALES, PASSES, one_centre=True)
         single = max(single, _elliptical(stars, merged, SCALES))
         likelihood = float(_log_density(stars, fit, SCALES).sum())
-        if best is None or likelihood > largest:
-            best, largest = (stars, fit), likelihood
-    assert best is not None
-    stars, fit = best
+        fits.append((stars, fit, likelihood))
+    # The solution also follows the chance fluctuations of the share, as one that varies does.
+    stars, fit, likelihood = max(
+        fits, key=lambda found: (found[2] - single) / (MORE_LIKELY if found[1].varies else 1.0)
+    )
+    gain = max(likelihood - single, 0.0)
+    p_value = len(fits) * float(chi2_sf(2 * gain, GROUP_DOF + 2 * fit.varies))
     own = _fitted(stars, fit, SCALES, PASSES // 2, shapes=True)
-    if _log_density(stars, own, SCALES).sum() > largest + LEAST_OF_OWN:
+    if _log_density(stars, own, SCALES).sum() > likelihood + LEAST_OF_OWN:
         fit = own
-    gain = max(largest - single, 0.0)
-    p_value = min(1.0, len(found) * float(chi2_sf(2 * gain, GROUP_DOF)))
-    return _described(stars, fit, p_value)
+    return _described(stars, fit, min(1.0, p_value))
 
 
 def _noise(stars: _Stars) -> Iterator[float]:
@@ -400,14 +459,18 @@ def _parts(stars: _Stars, m: _Mixture, scales: Float) -> tuple[Float, Float, Flo
     and the densities of both groups (B, 2, k, n) and of false matches (B, n), in units of those of
     the errors of single stars.
     """
-    e = stars.z[:, None, None] - _product(stars.whitening, np.moveaxis(m.centre, 2, 0)[..., None])
+    share = m.shares(stars.position)
+    centre = np.moveaxis(m.centre, 2, 0)[..., None]  # (2, B, 2, 1)
+    # the solution follows the mean displacement where the share varies
+    followed = (share - m.share[:, None]) * m.shift.T[..., None]  # (2, B, n) or (2, B, 1)
+    e = stars.z[:, None, None] - _product(stars.whitening, centre - followed[:, :, None])
     inverse = np.linalg.inv(m.shape)
     i, j, k = (inverse[..., a, b, None] for a, b in AXES)
     square = e[0] * (i * e[0] + 2 * j * e[1]) + k * e[1] ** 2
     norm = np.sqrt(np.linalg.det(inverse)) / (2 * np.pi)  # (B, 2)
-    weight = np.stack([1 - m.share, m.share], axis=1) * (1 - m.false)[:, None] * norm
-    weight = weight[..., None] * (m.scales / scales**2)[:, None]
-    core = weight[..., None] * np.exp(square[:, :, None] * (-0.5 / scales**2)[:, None])
+    weight = np.stack([1 - share, share], axis=1) * ((1 - m.false)[:, None] * norm)[..., None]
+    weight = weight[:, :, None] * (m.scales / scales**2)[:, None, :, None]
+    core = weight * np.exp(square[:, :, None] * (-0.5 / scales**2)[:, None])
     away = ((stars.residual[:, None] - m.wide_centre.T[..., None]) ** 2).sum(axis=0)
     exponent = -0.5 * away / m.wide[:, None] - stars.log_det
     return e, square, core, (m.false / (2 * np.pi * m.wide))[:, None] * np.exp(exponent)
@@ -446,6 +509,12 @@ def _fitted(
         of_group = core.sum(axis=3)  # (B, 2, k)
         weight = np.einsum("bckn,k->bcn", core, scales**-2.0)
         normal, right = _equations(weight @ products, m.shape)
+        if m.varies:
+            share = m.shares(stars.position)
+            # the mean displacement that the solution follows is part of the residuals
+            followed = weight * (share - m.share[:, None])[:, None]
+            matrix = _equations(followed @ products, m.shape)[0]
+            right = right + (matrix @ m.shift[:, None, :, None])[..., 0]
         if one_centre:
             normal, right = (np.repeat(x.sum(axis=1)[:, None], 2, axis=1) for x in (normal, right))
         centre = np.asarray(np.linalg.solve(normal, right[..., None])[..., 0], float)
@@ -459,8 +528,12 @@ def _fitted(
         n_false = false.sum(axis=1) + TINY
         wide_centre = false @ stars.residual.T / n_false[:, None]
         of_square = false @ (stars.residual**2).sum(axis=0) / n_false
+        share_at_centre, slope = members[:, 1] / inside, m.slope
+        if m.varies:
+            share_at_centre, slope = _share_step(stars.position, m, core.sum(axis=2))
         m = _Mixture(
-            members[:, 1] / inside,
+            share_at_centre,
+            slope,
             centre,
             np.asarray(shape + floor[..., None, None] * np.eye(2), float),
             of_group.sum(axis=1) / inside[:, None],
@@ -469,6 +542,22 @@ def _fitted(
             np.maximum((of_square - (wide_centre**2).sum(axis=1)) / 2, least),
         )
     return m
+
+
+def _share_step(position: Float, m: _Mixture, members: Float) -> tuple[Float, Float]:
+    """Share (B,) at the centre and slopes (B, 2) after a Newton step of the logistic regression.
+
+    `members` (B, 2, n) are the probabilities of each star to belong to the two groups.
+    """
+    share, either = m.shares(position), members.sum(axis=1)
+    design = np.stack([np.ones(position.shape[1]), *position])
+    gradient = (members[:, 1] - share * either) @ design.T
+    curvature = np.einsum("bn,in,jn->bij", either * share * (1 - share), design, design)
+    curvature += 1e-6 * (1.0 + np.trace(curvature, axis1=1, axis2=2))[:, None, None] * np.eye(3)
+    step = np.linalg.solve(curvature, gradient[..., None])[..., 0]
+    logits = np.column_stack([logit(m.share), m.slope]) + step
+    logits = np.clip(logits, -LARGEST_LOGIT, LARGEST_LOGIT)
+    return np.asarray(expit(logits[:, 0])), np.asarray(logits[:, 1:])
 
 
 def _equations(sums: Float, shape: Float) -> tuple[Float, Float]:
@@ -520,21 +609,31 @@ def _described(stars: _Stars, m: _Mixture, p_value: float) -> DisplacedGroup:
     e, _, core, wide = _parts(stars, m, SCALES)
     total = core.sum(axis=(1, 2))[0] + wide[0] + TINY
     core = core[0] / total
-    p = float(np.clip(m.share[0], 1e-6, 1 - 1e-6))
+    share = np.clip(m.shares(stars.position)[0], 1e-6, 1 - 1e-6)
+    p = float(share.mean())
     precise = (core / (SCALES**2)[:, None]).sum(axis=1)  # (2, n)
     pull = np.einsum("cjk,kcn->jcn", np.linalg.inv(m.shape[0]), e[:, 0])
-    of_centres = precise * _product(stars.whitening, pull)  # (2, 2, n): axis, group
+    one, other = np.moveaxis(precise * _product(stars.whitening, pull), 1, 0)  # (2, n): axis
+    # a centre moves both groups where the share differs from that at X = Y = 0
+    followed = share - m.share[0]
+    of_centres = one * (1 + followed) + other * followed, other * (1 - followed) - one * followed
     members = core.sum(axis=1)
-    of_share = members[1] / p - members[0] / (1 - p)
-    score = np.column_stack([*of_centres[:, 0], *of_centres[:, 1], of_share])
-    information = score.T @ score
-    covariance = np.linalg.pinv(information)
-    shift = m.centre[0, 1] - m.centre[0, 0]
-    difference = np.concatenate([-np.eye(2), np.eye(2), np.zeros((2, 1))], axis=1)
+    of_logit = members[1] * (1 - share) - members[0] * share
+    design = np.stack([np.ones(len(total)), *(stars.position if m.varies else ())])
+    score = np.concatenate([*of_centres, of_logit * design])
+    covariance = np.linalg.pinv(score @ score.T)
+    shift = m.shift[0]
+    difference = np.concatenate([-np.eye(2), np.eye(2), np.zeros((2, len(design)))], axis=1)
     of_shift = difference @ covariance @ difference.T
+    by_logit = (share * (1 - share) * design).mean(axis=1)
+    share_sigma = float(np.sqrt(by_logit @ covariance[4:, 4:] @ by_logit))
     larger = 0
     if p > 0.5:
-        p, shift, larger = 1 - p, -shift, 1
+        p, share, shift, larger = 1 - p, 1 - share, -shift, 1
+    between = None
+    if m.varies:
+        low, high = np.quantile(share, [0.05, 0.95])
+        between = float(low), float(high)
     # scatter of the typical star along the displacement
     way = shift / max(float(np.hypot(*shift)), TINY)
     along = _product(np.median(stars.whitening, axis=1), way)
@@ -543,10 +642,11 @@ def _described(stars: _Stars, m: _Mixture, p_value: float) -> DisplacedGroup:
     return DisplacedGroup(
         p_value,
         p,
-        float(np.sqrt(covariance[4, 4])),
+        share_sigma,
         (float(shift[0]), float(shift[1])),
         (float(np.sqrt(of_shift[0, 0])), float(np.sqrt(of_shift[1, 1]))),
         float(np.hypot(*shift) * np.sqrt(inverse)),
+        between,
     )
 
 

@@ -196,7 +196,8 @@ class Described:
 def described(test: ScoreTest) -> Described:
     """Numbers in the finding of a displaced group of stars."""
     pair = r"(-?[\d.]+) \+- ([\d.]+)"
-    text = rf"{pair} % of them by {pair} pix along u and {pair} pix along v"
+    varies = r"(?: \(from \d+ to \d+ % over the field\))?"
+    text = rf"{pair} % of them{varies} by {pair} pix along u and {pair} pix along v"
     found = re.search(text, test.finding)
     assert found, test.finding
     share, share_sigma, u, sigma_u, v, sigma_v = map(float, found.groups())

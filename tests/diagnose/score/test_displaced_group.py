@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from astropy.table import Table
@@ -125,6 +127,33 @@ def test_a_run_states_share_and_displacement_and_does_not_decide(name, full):
                 assert word not in other.sentence
         assert not any(word in advice for word in MISLEADING)
     assert np.abs(deviations).max() < (4.5 if full else 4.0)
+
+
+def test_visits_merged_without_a_label_are_a_group_whose_share_varies(full):
+    """The second of two visits has more stars at one side, and the solution follows the mean."""
+    n, found = 2000, []
+    for seed in range(12 if full else 3):
+        rng = np.random.default_rng([75, seed])
+        x, y = rng.uniform(0.5, SIDE + 0.5, (2, n))
+        angle = rng.uniform(0, 2 * np.pi)
+        shift = 2.5 * SIGMA * np.array([np.cos(angle), np.sin(angle)])
+        second = rng.uniform(size=n) < 0.1 + 0.8 * x / SIDE
+        uv = true_map(x, y) + SIGMA * gaussian(rng, n) + second[:, None] * shift
+        uv += (rng.uniform(size=n) < 0.04)[:, None] * 0.6 * gaussian(rng, n)
+        test = examined(matches_of(x, y, uv))[NAME]
+        assert test.significant
+        group = described(test)
+        low, high = (
+            float(share) for share in re.findall(r"from (\d+) to (\d+) %", test.finding)[0]
+        )
+        # 5 % and 95 % of the stars: 0.14 and 0.86
+        assert 5 < low < 30 and 70 < high < 95
+        sign = np.sign(group.shift @ shift)  # either visit may be the displaced one
+        drawn = second.mean() if sign > 0 else 1 - second.mean()
+        off = [group.share - drawn, *(sign * group.shift - shift)]
+        found.append(np.array(off) / [group.share_sigma, *group.shift_sigma])
+        assert group.share_sigma < 0.04 and group.shift_sigma.max() < 0.25 * SIGMA
+    assert np.abs(found).max() < 4.5
 
 
 def test_errors_that_are_tilted_and_very_unequal(full):
