@@ -22,10 +22,10 @@ above minus (p - p_0) d, where p_0 is p at X = Y = 0.
 The alternative is noise about a single centre, with the same false matches: any elliptical
 distribution in units of the errors (Student's t, errors that are wrong by various factors, matches
 that were cut at a radius in units of their errors), two such distributions of different shapes,
-normal errors that were cut at a radius in pixels, and normal errors of positions that were rounded
-afterwards.  Wherever errors differ from star to star, both descriptions may take equal ones, or the
-stated ones without a common part, since errors that were estimated from the residuals and a fitted
-jitter include the displacement.
+with fractions that may vary over the field, normal errors that were cut at a radius in pixels, and
+normal errors of positions that were rounded afterwards.  Wherever errors differ from star to star,
+both descriptions may take equal ones, or the stated ones without a common part, since errors that
+were estimated from the residuals and a fitted jitter include the displacement.
 
 Twice the logarithm of the ratio of both likelihoods is compared with chi-square of `GROUP_DOF`
 degrees of freedom, and two more if p varies.  The noise has more freedom than the mixture without
@@ -409,6 +409,15 @@ def _noise(stars: _Stars) -> Iterator[float]:
         size = np.trace(shape) / 2
         starts.append(size * np.stack([1.5 * along + 0.5 * across, 0.5 * along + 1.5 * across]))
     several = alone.repeated(len(starts))._replace(share=np.full(3, 0.5), shape=np.stack(starts))
+    several = _fitted(stars, several, SCALES, PASSES, one_centre=True, shapes=True)
+    yield float(np.nanmax(_log_density(stars, several, SCALES).sum(axis=1)))
+    # errors that differ over the field
+    slopes = START_SLOPE * np.concatenate([np.eye(2), -np.eye(2)])
+    several = alone.repeated(len(slopes))._replace(
+        share=np.full(len(slopes), 0.5),
+        slope=slopes,
+        shape=np.stack([[1.5 * shape, 0.4 * shape]] * len(slopes)),
+    )
     several = _fitted(stars, several, SCALES, PASSES, one_centre=True, shapes=True)
     yield float(np.nanmax(_log_density(stars, several, SCALES).sum(axis=1)))
     yield _cut(stars)

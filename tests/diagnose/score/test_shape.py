@@ -155,7 +155,7 @@ def test_probabilities_are_even_inside_the_family(full):
                 assert stats.kstest(p, "uniform").pvalue > 1e-3
 
 
-@pytest.mark.parametrize("kind", ["corner", "axis", "rising"])
+@pytest.mark.parametrize("kind", ["corner", "axis", "rising", "rising along v", "exponential"])
 def test_noise_that_is_symmetric_is_not_lopsided(kind):
     """However much it differs over the field or between the axes."""
     rng = np.random.default_rng(6)
@@ -164,6 +164,8 @@ def test_noise_that_is_symmetric_is_not_lopsided(kind):
         "corner": np.where((x > 1500) & (y > 1500), 5.0, 1.0)[:, None],
         "axis": np.array([1.0, 2.0]),
         "rising": 2.0 + scaled(x)[:, None],
+        "rising along v": np.column_stack([np.ones(3000), 2.0 + scaled(y)]),
+        "exponential": np.exp(1.2 * scaled(x))[:, None],
     }[kind]
     found = examined(matches_of(x, y, true_map(x, y) + SIGMA * factor * gaussian(rng, 3000)))
     assert min(found[test].p_value for test in SHAPE) > 1e-3
