@@ -14,11 +14,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 import scipy.linalg
-from scipy.special import expit, logsumexp
 
 from bayesdist.diagnose.correlated.information import (
     GroupCells,
@@ -58,7 +56,6 @@ RANGE = 10.0
 SHAPE = 0.3  # relative tolerance of the correlation at a separation, compared with a Matern field
 SINES = 10  # along each side of a chip; finer sines do not change the polynomials
 QUADRATIC = polynomial_terms(SECOND_ORDER)[n_terms(SECOND_ORDER - 1) :]
-OF_FIELD = 0.5  # prior probability that second-order terms of exposures are those of smooth fields
 STARS_PER_TERM = 2  # per exposure and chip; with fewer, its second-order terms are not estimated
 
 
@@ -136,14 +133,13 @@ def exposure_fields(
     pixel = model.pixel_size(working.theta)
     chips = [_Terms.of(information, working, code) for code in range(len(model.chips))]
     terms = [chip for chip in chips if chip is not None]
-    second = _SecondOrder.of(terms, priors.higher_order * pixel)
+    pull, tau = _second_order_draws(terms, priors.higher_order * pixel, model.n_params, n, rng)
     sizes = [chip.size for chip in model.chips]
     products = {} if stars is None else exposure_products(stars, sizes)
-    smooth = _Fields.of(list(products.values()), priors.structure * pixel)
-    of_terms, of_field = _joint_draws(second, smooth, n, rng)
-    pull, tau = second.pull(of_terms, model.n_params, rng), second.grid[of_terms]
-    amplitude, length = smooth.amplitude[of_field], smooth.length[of_field]
+    amplitude, length = np.zeros(n), np.full(n, LENGTHS[-1])
     if products:
+        size = priors.structure * pixel
+        amplitude, length = _field_draws(list(products.values()), size, n, rng)
         pull += _followed(working, amplitude, length, rng)
     return ExposureFields(pull @ working.covariance, tau, amplitude, length, n_exposures)
 
@@ -279,124 +275,44 @@ def _onto_parameters(cells: GroupCells, values: Float, n_params: int) -> Float:
     return out
 
 
-@dataclass(frozen=True, eq=False)
-class _SecondOrder:
-    """Posterior of the scatter of second-order terms, on a grid."""
+def _second_order_draws(
+    chips: Sequence[_Terms], median: float, n_params: int, n: int, rng: np.random.Generator
+) -> tuple[Float, Float]:
+    """Pull (n, D) of the second-order terms on the fit, and draws (n,) of their scatter.
 
-    grid: Float  # (STEPS,) scatters
-    log_prior: Float  # (STEPS,) normalised
-    # posterior of the terms on each chip, for each scatter; empty without enough stars
-    posteriors: list[list[_GivenScatter]]
-
-    @classmethod
-    def of(cls, chips: Sequence[_Terms], median: float) -> _SecondOrder:
-        """Posterior for all chips; `median` is that of the prior."""
-        if not chips:
-            return cls(np.zeros(1), np.zeros(1), [[]])
-        eigenvalues = np.concatenate([terms.values.ravel() for terms in chips])
-        eigenvalues = eigenvalues[eigenvalues > 1e-8 * eigenvalues.max()]
-        resolved = float(np.median(eigenvalues)) ** -0.5
-        chips = [_with_loose(terms, WIDE * resolved) for terms in chips]
-        largest = max(
-            float(np.sqrt(np.mean(terms.given(WIDE * resolved).squares()[terms.loose == 0])))
-            for terms in chips
-        )
-        grid, log_prior = _amplitudes(median, resolved, largest)
-        return cls(grid, log_prior, [[terms.given(tau) for terms in chips] for tau in grid])
-
-    @cached_property
-    def log_evidence(self) -> Float:
-        """Log-likelihood (STEPS,) of each scatter."""
-        return np.array([sum(one.log_evidence for one in given) for given in self.posteriors])
-
-    def pull(self, index: Int, n_params: int, rng: np.random.Generator) -> Float:
-        """Pull (n, D) on the fit of terms with the scatters `index` (n,), numbers in the grid.
-
-        The sign is reversed because the fit absorbs the terms.
-        """
-        out = np.zeros((len(index), n_params))
-        for k in np.unique(index):
-            rows = np.flatnonzero(index == k)
-            for posterior in self.posteriors[k]:
-                coefficients = posterior.draws(len(rows), rng)
-                out[rows] -= np.tensordot(coefficients, posterior.of.taken, axes=2)
-        return out
-
-
-@dataclass(frozen=True, eq=False)
-class _Fields:
-    """Posterior of the amplitude and correlation length of smooth fields, on a grid.
-
-    It follows from products of neighbours.  The mean square of a field with few independent patches
-    scatters in all bins together.
+    The sign is reversed because the fit absorbs the terms.
     """
-
-    amplitude: Float  # (m,)
-    length: Float  # (m,)
-    log_prior: Float  # (m,) normalised
-    log_likelihood: Float  # (m,)
-    second_order: Float  # (m,) scatter of the second-order terms of such a field
-
-    @classmethod
-    def of(cls, chips: Sequence[ExposureProducts], median: float) -> _Fields:
-        """Posterior for all chips; `median` is that of the prior of the amplitude."""
-        if not chips:
-            one = np.zeros(1)
-            return cls(one, LENGTHS[-1:], one, one, one)
-        fits = np.array([[chip.amplitude(length) for chip in chips] for length in LENGTHS])
-        resolved = float(np.sqrt(fits[..., 1].min()))
-        largest = float(np.sqrt(max(fits[..., 0].max(), 0.0)))
-        grid, log_prior = _amplitudes(median, resolved, largest)
-        log = [sum(_log_likelihood(chip, grid, length) for chip in chips) for length in LENGTHS]
-        terms = [
-            np.sqrt(np.mean([modes(chip.size, length).second_order for chip in chips]))
-            for length in LENGTHS
-        ]
-        return cls(
-            np.tile(grid, len(LENGTHS)),
-            np.repeat(LENGTHS, STEPS),
-            np.tile(log_prior, len(LENGTHS)) - np.log(len(LENGTHS)),
-            np.concatenate(log),
-            np.outer(terms, grid).ravel(),
-        )
-
-
-def _joint_draws(
-    second: _SecondOrder, fields: _Fields, n: int, rng: np.random.Generator
-) -> tuple[Int, Int]:
-    """Numbers (n,) in the grids of the second-order scatter and of the fields.
-
-    Smooth fields contain terms of the second order.  With the prior probability `OF_FIELD` these
-    are all that exposures have, so that either is evidence for both; otherwise the terms have a
-    scatter of their own, which is independent of the fields.
-    """
-    of_second = second.log_prior + second.log_evidence
-    of_fields = fields.log_prior + fields.log_likelihood
-    if len(second.grid) == 1 or len(fields.amplitude) == 1:  # the data allow only one of both
-        return _numbers(of_second, n, rng), _numbers(of_fields, n, rng)
-    distance = np.log(second.grid) - np.log(fields.second_order)[:, None]
-    index = np.argmin(np.abs(distance), axis=1)
-    linked = of_fields + second.log_evidence[index]
-    odds = logsumexp(linked) - logsumexp(of_second) - logsumexp(of_fields)
-    n_linked = rng.binomial(n, expit(odds + np.log(OF_FIELD / (1 - OF_FIELD))))
-    number = _numbers(linked, n_linked, rng)
-    apart = _numbers(of_second, n - n_linked, rng), _numbers(of_fields, n - n_linked, rng)
-    order = rng.permutation(n)
-    return (
-        np.concatenate([index[number], apart[0]])[order],
-        np.concatenate([number, apart[1]])[order],
+    pull, drawn = np.zeros((n, n_params)), np.zeros(n)
+    if not chips:
+        return pull, drawn
+    eigenvalues = np.concatenate([terms.values.ravel() for terms in chips])
+    eigenvalues = eigenvalues[eigenvalues > 1e-8 * eigenvalues.max()]
+    resolved = float(np.median(eigenvalues)) ** -0.5
+    chips = [_with_loose(terms, WIDE * resolved) for terms in chips]
+    largest = max(
+        float(np.sqrt(np.mean(terms.given(WIDE * resolved).squares()[terms.loose == 0])))
+        for terms in chips
     )
-
-
-def _numbers(log_weight: Float, n: int, rng: np.random.Generator) -> Int:
-    """Draw n numbers with probabilities proportional to exp(log_weight), in random order."""
-    weight = np.exp(log_weight - log_weight.max())
-    counts = rng.multinomial(n, weight / weight.sum())
-    return rng.permutation(np.repeat(np.arange(len(counts)), counts))
+    grid, log_prior = _amplitudes(median, resolved, largest)
+    posteriors = [[terms.given(tau) for terms in chips] for tau in grid]
+    log = log_prior + np.array(
+        [sum(chip_posterior.log_evidence for chip_posterior in chip) for chip in posteriors]
+    )
+    weight = np.exp(log - log.max())
+    grid_index = rng.permutation(
+        np.repeat(np.arange(STEPS), rng.multinomial(n, weight / weight.sum()))
+    )
+    for k in np.unique(grid_index):
+        rows = np.flatnonzero(grid_index == k)
+        drawn[rows] = grid[k]
+        for posterior in posteriors[k]:
+            coefficients = posterior.draws(len(rows), rng)
+            pull[rows] -= np.tensordot(coefficients, posterior.of.taken, axes=2)
+    return pull, drawn
 
 
 def _amplitudes(median: float, resolved: float, largest: float) -> tuple[Float, Float]:
-    """Grid of amplitudes (STEPS,), and log prior probabilities for a sum over them.
+    """Grid of amplitudes (STEPS,), and log prior weights for a sum over them.
 
     The grid extends beyond the prior median, the resolution of the data, and the largest size that
     the data suggest, where the likelihood is negligible: even two exposures have many terms and
@@ -405,8 +321,7 @@ def _amplitudes(median: float, resolved: float, largest: float) -> tuple[Float, 
     grid = np.geomspace(
         min(median, resolved) / RANGE, RANGE * max(median, resolved, largest), STEPS
     )
-    log_prior = log_half_t(grid, median, STRUCTURE_DOF) + log_widths(grid, beyond=0.0)
-    return grid, log_prior - logsumexp(log_prior)
+    return grid, log_half_t(grid, median, STRUCTURE_DOF) + log_widths(grid, beyond=0.0)
 
 
 def _with_loose(terms: _Terms, start: float) -> _Terms:
@@ -445,6 +360,27 @@ def _with_loose(terms: _Terms, start: float) -> _Terms:
         squared_terms = along[worst] / np.maximum(terms.values[worst], 1e-300) ** 2
         loose[worst] = max(loose[worst], float(np.mean(squared_terms[terms.values[worst] > 0])))
     return terms
+
+
+def _field_draws(
+    chips: Sequence[ExposureProducts], median: float, n: int, rng: np.random.Generator
+) -> tuple[Float, Float]:
+    """Draws (n,) of amplitude and correlation length of the field, from products of neighbours.
+
+    The mean square of a field with few independent patches scatters in all bins together.
+    """
+    fits = np.array([[chip.amplitude(length) for chip in chips] for length in LENGTHS])
+    resolved = float(np.sqrt(fits[..., 1].min()))
+    largest = float(np.sqrt(max(fits[..., 0].max(), 0.0)))
+    grid, log_prior = _amplitudes(median, resolved, largest)
+    log = np.empty((len(LENGTHS), STEPS))
+    for k, length in enumerate(LENGTHS):
+        log[k] = sum(_log_likelihood(chip, grid, length) for chip in chips)
+    log += log_prior
+    weight = np.exp(log - log.max()).ravel()
+    counts = rng.multinomial(n, weight / weight.sum())
+    grid_index = rng.permutation(np.repeat(np.arange(len(counts)), counts))
+    return grid[grid_index % STEPS], LENGTHS[grid_index // STEPS]
 
 
 def _log_likelihood(chip: ExposureProducts, amplitude: Float, length: float) -> Float:

@@ -44,7 +44,7 @@ from bayesdist.diagnose.correlated.priors import legendre_products
 from bayesdist.infer.stars.likelihood import Likelihood
 from bayesdist.infer.stars.stars import prepare
 from bayesdist.model import DistortionModel
-from bayesdist.model.basis import n_terms, polynomial_terms
+from bayesdist.model.basis import polynomial_terms
 from bayesdist.model.grid import cell_index
 from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.random import matern
@@ -506,7 +506,6 @@ class Modes:
     patches: float  # (sum L)^2 / sum L^2: degrees of freedom of the mean square
     # (sum L^2)^3 / (sum L^3)^2: of the chi-square with the skewness of a sum of products
     dof: float
-    second_order: float  # mean variance of the terms of second order, of unit mean square
 
 
 @lru_cache(maxsize=64)
@@ -519,14 +518,11 @@ def modes(size: tuple[float, float], length: float) -> Modes:
     place = np.column_stack([X, Y]) * half
     K = matern(np.linalg.norm(place[:, None] - place, axis=2) / length)
     phi = np.linalg.qr(legendre_products(X, Y, polynomial_terms(SECOND_ORDER)))[0]
-    second = phi[:, n_terms(SECOND_ORDER - 1) :]
-    variance = float(np.trace(second.T @ K @ second) / second.shape[1] / len(K))
     K -= phi @ (phi.T @ K)
     K -= (K @ phi) @ phi.T
     values = np.linalg.eigvalsh(K)
-    total, square, cube = values.sum(), (values**2).sum(), (values**3).sum()
-    patches, dof = float(total**2 / square), float(square**3 / cube**2)
-    return Modes(float(total / len(values)), patches, dof, variance)
+    total, second, third = values.sum(), (values**2).sum(), (values**3).sum()
+    return Modes(float(total / len(values)), float(total**2 / second), float(second**3 / third**2))
 
 
 def _middles(n: int) -> Float:
