@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from types import SimpleNamespace
 
 import numpy as np
@@ -248,7 +249,17 @@ def test_a_match_circle_that_is_known_is_no_skewness():
     assert "u_nominal" in found["skewness by position"].remedy
 
 
-def test_what_displaced_stars_do_has_their_remedy():
+def test_visits_without_a_label_are_a_displaced_group():
+    found = examined(scene(np.random.default_rng(1), 3000, DISPLACED["visits overlap"][0]))
+    [check] = score_checks(list(found.values()))
+    assert check.doubt and check.sentence.startswith("a part of the stars is displaced")
+    assert "exposures and visits without a label" in check.sentence
+
+
+def test_what_displaced_stars_do_has_their_remedy(monkeypatch):
+    """Where no single displacement describes them."""
+    module = import_module("bayesdist.diagnose.score.shape")  # its package has a function `score`
+    monkeypatch.setattr(module, "displaced_group", lambda *_: None)
     found = examined(scene(np.random.default_rng(1), 3000, DISPLACED["visits overlap"][0]))
     assert found["noise by position"].significant and found["noise by axis"].significant
     correlated = SimpleNamespace(facts={}, linear=None, structure=("a field",), structure_rms=1.0)
