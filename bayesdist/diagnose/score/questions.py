@@ -7,7 +7,8 @@ out of them, the statistic, its p-value and the smallest effect that would have 
 A test of many directions is insensitive to each of them.  Where the likely effect is known, its
 patterns are tested one by one in addition.  Trails of charge displace stars along one axis, in
 proportion to the number of pixels to the amplifier, and more so the fainter they are; stars that
-are so bright that they change the field in the silicon are displaced in proportion to their flux.
+are so bright that they change the field in the silicon are displaced in proportion to their flux;
+fields at the edges of the silicon displace stars outwards or inwards.
 The p-values of all these tests, p_i, are combined into one (Liu and Xie 2020):
 
     p = 1/2 - arctan(t) / pi        t = sum of w_i tan((1/2 - p_i) pi)        sum of w_i = 1
@@ -134,6 +135,14 @@ class Products:
 
 
 @dataclass(frozen=True, eq=False)
+class Pattern:
+    """A combination of functions of the detections that a likely effect has on each chip."""
+
+    products: tuple[Products, ...]  # f functions without directions
+    combination: Float  # (2 f, 1) of both axes of the first function, of the second, ...
+
+
+@dataclass(frozen=True, eq=False)
 class Question:
     """Functions of the detections that a model may lack and that are tested together."""
 
@@ -144,8 +153,8 @@ class Question:
     # group of families that a second test fits as well; if that test is insignificant, its result
     # is used
     adjusted_for: str = ""
-    # likely patterns, which are also tested one by one; their terms are `LINEAR`
-    patterns: tuple[Products, ...] = ()
+    # likely patterns, which are also tested one by one
+    patterns: tuple[Pattern, ...] = ()
 
 
 def order_family(total: int, order: int) -> Family:
@@ -170,7 +179,9 @@ def questions(sample: ScoredSample) -> Iterator[Question]:
     if sample.mag is not None:
         magnitude = Products(LINEAR, _standing_out(sample.mag))
         flux = Products(LINEAR, _standing_out(_relative_flux(sample.mag)))
-        yield Question(MAGNITUDE, (magnitude,), patterns=(magnitude, flux))
+        rising = tuple(_rising_from_edges())
+        patterns = tuple(Pattern((part,), way) for part in (magnitude, flux) for way in rising)
+        yield Question(MAGNITUDE, (magnitude,), patterns=patterns)
     if sample.offset is not None and sample.position is not None:
         # effect, to first order, of a curved sky on the tangent planes of exposures
         p, q = sample.position
@@ -181,10 +192,11 @@ def questions(sample: ScoredSample) -> Iterator[Question]:
     if sample.colour is not None:
         yield Question(COLOUR, (Products(LINEAR, _standing_out(sample.colour)),))
     if len(sample) >= MIN_AT_EDGES:
-        rising = [np.exp((s * Z - 1.0) / NEAR_EDGE) for Z in (sample.X, sample.Y) for s in (-1, 1)]
-        edges = tuple(Products(CONSTANT, value - value.mean()) for value in rising)
+        near = [np.exp((s * Z - 1.0) / NEAR_EDGE) for Z in (sample.X, sample.Y) for s in (-1, 1)]
+        edges = tuple(Products(CONSTANT, value - value.mean()) for value in near)
+        outwards = tuple(Pattern(edges, combination) for combination in _outwards())
         # missing orders rise towards the edges as well
-        yield Question(EDGES, edges, adjusted_for="orders")
+        yield Question(EDGES, edges, adjusted_for="orders", patterns=outwards)
     if len(sample) >= MIN_OF_PHASES:
         yield Question(PIXEL_PHASE, tuple(Products(CONSTANT, wave) for wave in _phases(sample)))
     if cut_off := tuple(
@@ -393,23 +405,27 @@ def functions_for(sample: ScoredSample, asked: Iterable[Question] | None = None)
         start += len(functions)
         groups.setdefault(question.family.group, []).append(functions)
         none = np.zeros(0, np.int64)
-        tested = Regressors(question.family, functions, combination, question.least, none)
-        regressors.append(tested)
+        of_question = [Regressors(question.family, functions, combination, question.least, none)]
+        known = {question.products: functions}
         for pattern in question.patterns:
-            of_pattern = functions
-            if pattern not in question.products:
-                of_pattern = start + np.arange(len(pattern.terms))
-                products.append(pattern)
-                start += len(pattern.terms)
-            regressors += [
-                replace(tested, functions=of_pattern, combination=rising, is_pattern=True)
-                for rising in _rising_from_edges()
-            ]
+            if pattern.products not in known:
+                known[pattern.products] = start + np.arange(
+                    sum(len(product.terms) for product in pattern.products)
+                )
+                products += pattern.products
+                start += len(known[pattern.products])
+            of_question.append(
+                replace(
+                    of_question[0],
+                    functions=known[pattern.products],
+                    combination=pattern.combination,
+                    is_pattern=True,
+                )
+            )
+        regressors += of_question
         if question.adjusted_for:
             adjustment = np.concatenate([none, *groups.get(question.adjusted_for, [])])
-            regressors.append(
-                Regressors(question.family, functions, combination, question.least, adjustment)
-            )
+            regressors += [replace(tested, adjusted_for=adjustment) for tested in of_question]
     return TestedFunctions(sample, tuple(products), tuple(regressors))
 
 
@@ -444,6 +460,19 @@ def _rising_from_edges() -> Iterator[Float]:
             yield combination
 
 
+def _outwards() -> Iterator[Float]:
+    """Iterate over displacements away from the middle of the chip, at all edges and at each alone.
+
+    They are combinations (8, 1) of both axes of the functions that rise towards the first and the
+    last column, and the first and the last row.
+    """
+    each = np.zeros((4, 8, 1))
+    for k, sign in enumerate((-1.0, 1.0, -1.0, 1.0)):
+        each[k, 2 * k + k // 2] = sign
+    yield each.sum(axis=0)
+    yield from each
+
+
 def one_of_each(found: Iterable[tuple[Regressors, Outcome]]) -> list[Outcome]:
     """Outcomes with one test per question.
 
@@ -451,18 +480,22 @@ def one_of_each(found: Iterable[tuple[Regressors, Outcome]]) -> list[Outcome]:
     adjusted test is insignificant, its result is used: adjusting for other functions reduces the
     power of a test but does not remove a real effect.
     """
-    pairs = list(found)
-    of_all = [pair for pair in pairs if not pair[0].is_pattern]
-    out = {result.name: result for several, result in of_all if not len(several.adjusted_for)}
-    patterns: dict[str, list[float]] = {}
-    for several, result in pairs:
-        if several.is_pattern and result.name in out:
-            patterns.setdefault(result.name, []).append(result.p_value)
-    for name, p_values in patterns.items():
-        out[name] = _with_patterns(out[name], p_values)
-    for several, result in of_all:
-        if len(several.adjusted_for) and result.name in out and result.p_value > SAYS_NOTHING:
-            out[result.name] = result
+    # by name, and whether other functions are adjusted for
+    of_all: dict[tuple[str, bool], Outcome] = {}
+    patterns: dict[tuple[str, bool], list[float]] = {}
+    for several, result in found:
+        key = result.name, len(several.adjusted_for) > 0
+        if several.is_pattern:
+            patterns.setdefault(key, []).append(result.p_value)
+        else:
+            of_all[key] = result
+    for key, p_values in patterns.items():
+        if key in of_all:
+            of_all[key] = _with_patterns(of_all[key], p_values)
+    out = {name: result for (name, adjusted), result in of_all.items() if not adjusted}
+    for (name, adjusted), result in of_all.items():
+        if adjusted and name in out and result.p_value > SAYS_NOTHING:
+            out[name] = result
     return list(out.values())
 
 
